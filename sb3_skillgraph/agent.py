@@ -1,0 +1,754 @@
+"""The agent: an SB3 off-policy algorithm that discovers, plans, chains and learns (section 3, Figure 10)."""
+
+from typing import Any, ClassVar, Literal, TypeVar
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.vec_env import unwrap_vec_normalize
+from stable_baselines3.td3.policies import MultiInputPolicy
+
+from sb3_skillgraph.chaining import DeepSkillChaining
+from sb3_skillgraph.controller import GLOBAL, UNDECIDED, Controller, ControllerState, Request
+from sb3_skillgraph.curriculum import Curriculum, Strategy
+from sb3_skillgraph.events import SalientEvent, TerminationSet
+from sb3_skillgraph.goal_env import KEYS, GoalSpec, Oracle, check_finite, env_attribute, find_view, rows
+from sb3_skillgraph.graph import SkillGraph
+from sb3_skillgraph.interrupts import uninterrupted
+from sb3_skillgraph.options.factory import OptionFactory, copy_policy
+from sb3_skillgraph.options.learner import OptionDDPG, OptionLearner
+from sb3_skillgraph.options.option import Option
+from sb3_skillgraph.options.views import ScaledView, View
+from sb3_skillgraph.persistence import Persistence
+from sb3_skillgraph.planner import GraphPlanner, Plan
+from sb3_skillgraph.replay import TransitionStore
+from sb3_skillgraph.salience.discovery import EventDiscovery
+from sb3_skillgraph.salience.proposals import FrontierSalience, RandomSalience, Salience
+from sb3_skillgraph.visited import VisitedStates
+
+SelfSkillGraphAgent = TypeVar("SelfSkillGraphAgent", bound="SkillGraphAgent")
+
+#: The paper as written: one DDPG per option learned from its own experience, strict sets, uniform targets (Table 1, A).
+PAPER: dict[str, Any] = dict(
+    batch_size=64,
+    tau=0.01,
+    gamma=0.99,
+    policy_kwargs=dict(net_arch=[400, 300]),
+    option_kwargs=dict(actor_learning_rate=1e-4, critic_learning_rate=1e-3),
+    salience="rrt",
+    salient_event_freq=30,
+    retry_after=10,
+    events_per_attempt=2,
+    event_tries=1,
+    max_unconnected=None,
+    target_choice="uniform",
+    max_failures=None,
+    link_reach=0,
+    off_policy_runs=False,
+    containment=1.0,
+    evidence_edges=False,
+    rate_prior=0.0,
+    min_success_rate=0.0,
+    nearest="euclidean",
+    hindsight=0.0,
+    shared_experience=0.0,
+    warm_start=False,
+    global_update_fraction=0.0,
+)
+
+
+class SkillGraphAgent(Persistence):
+    """
+    Deep Skill Graphs (DSG): discovers salient events without reward, learns options that connect them, arranges both in
+    a graph and plans over it to goals never seen in training.
+
+    Paper: Bagaria, Crowley, Lim, Konidaris, *Skill Discovery for Exploration and Planning using Deep Skill Graphs* (2020).
+    The defaults are what works best; ``SkillGraphAgent(..., **PAPER)`` is the paper as written.
+
+    :param policy: ``"MultiInputPolicy"`` (goal environments have Dict observations)
+    :param env: a goal environment with Box actions, a VecEnv of such, or the id of one
+    :param learning_rate: learning rate of actor and critic; ``option_kwargs`` can give the two apart
+    :param buffer_size: transitions kept in the store that all options share
+    :param learning_starts: environment steps of random actions, without learning, at the start
+    :param batch_size: transitions in a minibatch
+    :param tau: soft update coefficient of the target networks
+    :param gamma: discount factor
+    :param train_freq: environment steps between updates
+    :param gradient_steps: minibatch updates, over all networks together, per ``train_freq`` steps
+    :param action_noise: SB3 action noise; by default Gaussian noise of ``exploration_noise``
+    :param replay_buffer_class: refused: options learn from one shared store
+    :param replay_buffer_kwargs: refused
+    :param optimize_memory_usage: refused
+    :param n_steps: refused unless 1
+    :param policy_kwargs: keyword arguments of every option's policy, ``net_arch`` for instance
+    :param stats_window_size: episodes over which SB3's rollout statistics are averaged
+    :param tensorboard_log: folder of the TensorBoard log
+    :param verbose: 0 for silence, 1 for the progress table
+    :param seed: seed of all generators
+    :param device: torch device
+    :param _init_setup_model: whether to build the networks at construction
+    :param use_sde: refused
+    :param option_class: SB3 off-policy class of the options' policies
+    :param option_kwargs: further keyword arguments for it
+    :param option_view: what a policy sees of (observation, achieved goal, goal): ``"relative"`` (all, and the goal
+        relative to where the agent stands), ``"egocentric"`` (without absolute position) or a function; None takes the
+        one the environment names in its attribute ``option_view``, else ``"relative"``
+    :param option_timeout: environment steps an option may run [A.6]
+    :param event_radius: radius of salient events, in goal units; None takes the environment's ``success_radius`` or
+        ``distance_threshold``
+    :param gestation_period: successes after which an option is mature
+    :param warm_start: gestating options act with the global option's policy and copy it when they mature; False lets
+        them learn from scratch
+    :param global_update_fraction: share of the updates that goes to the global option; executed options share the rest
+    :param hindsight: share of sampled transitions relabelled with a goal achieved later
+    :param shared_experience: share of an option's batches drawn from all experience rather than its own runs
+    :param salience: how events are proposed: ``"frontier"`` (visited states), ``"rrt"`` (uniform feasible states from
+        the environment's ``sample_free``) or an object with ``propose(rng)`` [3.2.1]
+    :param salient_event_freq: K: episodes since the last accepted event after which new ones are sought [A.1.2]
+    :param retry_after: R: episodes to wait after an attempt that yielded none [A.1.2]
+    :param events_per_attempt: events sought per attempt [A.1.2: a pair]
+    :param event_tries: proposals drawn per event until one is not redundant [A.1.1]
+    :param event_reach: environment steps that a ``frontier`` event lies at most beyond the last event on its trajectory
+    :param max_unconnected: no events are sought while so many are not joined to the graph; None for no limit
+    :param target_choice: ``"nearest"`` (the open chain whose source is cheapest to reach, the way back included) or
+        ``"uniform"`` (any event [3.2.2])
+    :param explore_prob: probability that a mission explores: to the event nearest to a random point, and beyond
+    :param exploration_steps: environment steps of such an exploration
+    :param practise_prob: probability that a mission goes to a random event of the graph
+    :param max_tries: timed-out options after which a mission is given up
+    :param max_failures: timed-out options in a row after which a chain is given up; None for never
+    :param link_reach: a crossing between two events in at most so many steps opens a chain between them; 0 for never
+    :param off_policy_runs: whether any crossing between a chain's events counts for its gestating root
+    :param containment: share of recent samples of an effect set that must lie in an initiation set for an edge; 1.0 is
+        strict [3.2.6]
+    :param evidence_edges: whether successful runs begun in an event make an edge too
+    :param rate_prior: pseudo-counts of a success and a failure in success rates [A.2: none]
+    :param min_success_rate: success rate below which an edge is dropped
+    :param nearest: vertex nearest to a goal: by ``"steps"`` along trajectories or ``"euclidean"`` distance [3.2.3]
+    :param exploration_noise: standard deviation of Gaussian action noise, in units of the scaled action
+    :param random_action_prob: probability of a uniformly random action
+    :param random_hold: a random action is held for up to so many steps
+    :raises ValueError: if the environment is no goal environment with Box actions, or an argument is refused
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MultiInputPolicy": MultiInputPolicy}
+
+    def __init__(
+        self,
+        policy: str | type[BasePolicy],
+        env: GymEnv | str | None,
+        learning_rate: float | Schedule = 1e-3,
+        buffer_size: int = 1_000_000,
+        learning_starts: int = 1_000,
+        batch_size: int = 256,
+        tau: float = 0.005,
+        gamma: float = 0.98,
+        train_freq: int | tuple[int, str] = 1,
+        gradient_steps: int = 1,
+        action_noise: ActionNoise | None = None,
+        replay_buffer_class: type[ReplayBuffer] | None = None,
+        replay_buffer_kwargs: dict[str, Any] | None = None,
+        optimize_memory_usage: bool = False,
+        n_steps: int = 1,
+        policy_kwargs: dict[str, Any] | None = None,
+        stats_window_size: int = 100,
+        tensorboard_log: str | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        device: th.device | str = "auto",
+        _init_setup_model: bool = True,
+        *,
+        use_sde: bool = False,
+        option_class: type[OffPolicyAlgorithm] = OptionDDPG,
+        option_kwargs: dict[str, Any] | None = None,
+        option_view: str | View | None = None,
+        option_timeout: int = 200,
+        event_radius: float | None = None,
+        gestation_period: int = 3,
+        warm_start: bool = True,
+        global_update_fraction: float = 0.5,
+        hindsight: float = 0.8,
+        shared_experience: float = 0.5,
+        salience: Literal["frontier", "rrt"] | Salience = "frontier",
+        salient_event_freq: int = 30,
+        retry_after: int = 1,
+        events_per_attempt: int = 1,
+        event_tries: int = 20,
+        event_reach: int = 60,
+        max_unconnected: int | None = 5,
+        target_choice: Literal["nearest", "uniform"] = "nearest",
+        explore_prob: float = 0.2,
+        exploration_steps: int = 100,
+        practise_prob: float = 0.2,
+        max_tries: int = 3,
+        max_failures: int | None = 12,
+        link_reach: int = 100,
+        off_policy_runs: bool = True,
+        containment: float = 0.9,
+        evidence_edges: bool = True,
+        rate_prior: float = 1.0,
+        min_success_rate: float = 0.2,
+        nearest: Literal["steps", "euclidean"] = "steps",
+        exploration_noise: float = 0.1,
+        random_action_prob: float = 0.1,
+        random_hold: int = 10,
+    ) -> None:
+        # The keyword arguments as given: what is saved, and what load() builds the agent from.
+        self._arguments = {k: v for k, v in locals().items() if k not in ("self", "env", "_init_setup_model", "__class__")}
+        _refuse(replay_buffer_class, replay_buffer_kwargs, optimize_memory_usage, n_steps, use_sde)
+        super().__init__(
+            policy=policy,
+            env=env,  # type: ignore[arg-type]
+            learning_rate=learning_rate,
+            buffer_size=buffer_size,
+            learning_starts=learning_starts,
+            batch_size=batch_size,
+            tau=tau,
+            gamma=gamma,
+            train_freq=train_freq,
+            gradient_steps=gradient_steps,
+            action_noise=action_noise,
+            policy_kwargs=policy_kwargs,
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            verbose=verbose,
+            device=device,
+            seed=seed,
+            sde_support=False,
+            support_multi_env=True,
+        )
+        self._exploration_noise = exploration_noise
+        self._random_action_prob = random_action_prob
+        self._random_hold = random_hold
+        self._spec: GoalSpec | None = None
+        if env is not None:
+            self._spec = GoalSpec.of(self.observation_space, self.action_space)
+        if self.env is not None and unwrap_vec_normalize(self.env) is not None:
+            raise ValueError(
+                "VecNormalize is not supported: events and initiation sets live in raw goal space. Networks see goal "
+                "space in units of the event radius already; remove the wrapper."
+            )
+        if _init_setup_model:
+            self._setup_model()
+
+    # -- building -----------------------------------------------------------------------------------------------------
+
+    def _setup_model(self) -> None:
+        self._setup_lr_schedule()
+        self.set_random_seed(self.seed)
+        self._convert_train_freq()
+        args = self._arguments
+        spec = self._spec = GoalSpec.of(self.observation_space, self.action_space)
+        self.rng = np.random.default_rng(self.seed)
+        self.event_radius = self._event_radius()
+        self._view_name, function = find_view(args["option_view"], self.env)
+        self.view = ScaledView(function, self.event_radius)
+        self.store = TransitionStore(
+            self.buffer_size, spec.observation_dim, spec.goal_dim, spec.action_dim, n_envs=self.n_envs
+        )
+        # Under SB3's name as well: CheckpointCallback looks for it. Options learn from views of it.
+        self.replay_buffer = self.store  # type: ignore[assignment]
+        self._factory = OptionFactory(
+            args["option_class"],
+            self._option_kwargs(),
+            self.store,
+            self.view,
+            self._action_space(),
+            self.event_radius,
+            self.rng,
+            dict(hindsight=args["hindsight"], shared=args["shared_experience"], horizon=args["option_timeout"]),
+            self.device,
+        )
+        self.global_option = self._factory.make("global", None, None)
+        self.policy = self.global_option.learner.policy
+        self._build_skills()
+        self._build_curriculum()
+        self._begin_episodes()
+
+    def _action_space(self) -> spaces.Box:
+        assert isinstance(self.action_space, spaces.Box)
+        return self.action_space
+
+    def _event_radius(self) -> float:
+        radius = self._arguments["event_radius"]
+        for name in ("success_radius", "distance_threshold"):
+            if radius is None and self.env is not None:
+                radius = env_attribute(self.env, name)
+        if radius is None:
+            raise ValueError(
+                "event_radius is required: the environment has neither a success_radius nor a distance_threshold to take "
+                "it from. Give the distance, in goal units, within which a goal counts as reached."
+            )
+        if not float(radius) > 0:
+            raise ValueError(f"event_radius must be positive, not {radius!r}.")
+        return float(radius)
+
+    def _option_kwargs(self) -> dict[str, Any]:
+        option_class: type[OffPolicyAlgorithm] = self._arguments["option_class"]
+        kwargs: dict[str, Any] = dict(gamma=self.gamma, tau=self.tau, policy_kwargs=self.policy_kwargs)
+        if issubclass(option_class, OptionLearner):
+            if callable(self.learning_rate):
+                raise ValueError(
+                    f"{option_class.__name__} takes constant learning rates; for a schedule use option_class=TD3 or SAC."
+                )
+            kwargs.update(actor_learning_rate=self.learning_rate, critic_learning_rate=self.learning_rate)
+        else:
+            kwargs.update(learning_rate=self.learning_rate)
+        return {**kwargs, **(self._arguments["option_kwargs"] or {})}
+
+    def _build_skills(self) -> None:
+        args = self._arguments
+        spec = self._spec
+        assert spec is not None
+        self.graph = SkillGraph(
+            args["containment"], args["rate_prior"], args["evidence_edges"], args["min_success_rate"]
+        )
+        self.visited = VisitedStates(spec.goal_dim, 0.25 * self.event_radius, self.n_envs)
+        self.planner = GraphPlanner(self.graph, self.visited, self.event_radius, args["event_reach"], args["nearest"])
+        self.chaining = DeepSkillChaining(
+            self.graph, self._make_option, self._matured, args["gestation_period"], args["max_failures"]
+        )
+        self.controller = Controller(
+            self.global_option,
+            self.chaining,
+            self.planner,
+            self.view,
+            self.event_radius,
+            args["option_timeout"],
+            args["warm_start"],
+        )
+
+    def _build_curriculum(self) -> None:
+        args = self._arguments
+        self.discovery = EventDiscovery(
+            self.graph,
+            self._salience(),
+            self.event_radius,
+            args["salient_event_freq"],
+            args["retry_after"],
+            args["events_per_attempt"],
+            args["event_tries"],
+            args["max_unconnected"],
+        )
+        strategy = Strategy(**{name: args[name] for name in Strategy._fields})
+        self.curriculum = Curriculum(
+            self.graph,
+            self.chaining,
+            self.planner,
+            self.visited,
+            self.discovery,
+            strategy,
+            args["option_timeout"],
+            self.rng,
+            self.n_envs,
+        )
+
+    def _salience(self) -> Salience:
+        salience = self._arguments["salience"]
+        if salience == "frontier":
+            return FrontierSalience(self.visited, 2.0 * self.event_radius, self._arguments["event_reach"])
+        if salience == "rrt":
+            return RandomSalience(Oracle(self.get_env))
+        if not hasattr(salience, "propose"):
+            raise ValueError(
+                f"Unknown salience {salience!r}: use 'frontier', 'rrt' or an object with a method propose(rng) that "
+                "returns a point of goal space."
+            )
+        return salience  # type: ignore[no-any-return]
+
+    def _make_option(self, target: str, termination: TerminationSet) -> Option:
+        return self._factory.make(f"o{len(self.chaining.options) + 1}", target, termination)
+
+    def _matured(self, option: Option) -> None:
+        if self._arguments["warm_start"]:
+            copy_policy(self.global_option, option)
+
+    def _begin_episodes(self) -> None:
+        """Forget what the environments were in the middle of."""
+        spec = self._spec
+        assert spec is not None
+        self._state = ControllerState.fresh(self.n_envs)
+        self._held_actions = np.zeros((self.n_envs, spec.action_dim), dtype=np.float32)
+        self._hold_left = np.zeros(self.n_envs, dtype=np.int64)
+        self._pending: _Pending | None = None
+        self._executed: list[int] = []
+        self._credit = 0.0
+
+    # -- what users look at -------------------------------------------------------------------------------------------
+
+    @property
+    def events(self) -> list[SalientEvent]:
+        """All salient events in the order of their discovery."""
+        return list(self.graph.events.values())
+
+    @property
+    def planning(self) -> bool:
+        """Whether ``predict`` plans over the graph; if not, the global option walks straight to every goal."""
+        return self.controller.planning
+
+    @planning.setter
+    def planning(self, planning: bool) -> None:
+        self.controller.planning = planning
+
+    # -- learning: SB3's hooks ----------------------------------------------------------------------------------------
+
+    def learn(
+        self: SelfSkillGraphAgent,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int | None = 4,
+        tb_log_name: str = "SkillGraph",
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> SelfSkillGraphAgent:
+        """
+        Explore and learn, without reward, as any SB3 off-policy algorithm does with one.
+
+        :param total_timesteps: environment steps, over all environments
+        :param callback: SB3 callback(s), called at every step
+        :param log_interval: episodes between log entries
+        :param tb_log_name: name of the run for TensorBoard
+        :param reset_num_timesteps: False continues the last call: counters go on, and environments that can tell their
+            state are put where they were
+        :param progress_bar: show a progress bar
+        :return: the agent
+        :raises ValueError: if an observation holds NaN or inf
+        """
+        return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+
+    def _setup_learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        reset_num_timesteps: bool = True,
+        tb_log_name: str = "run",
+        progress_bar: bool = False,
+    ) -> tuple[int, BaseCallback]:
+        if not reset_num_timesteps:
+            # A call may overshoot by part of a roll-out; two calls of N then still end where one of 2N does.
+            total_timesteps -= max(0, min(self.num_timesteps - self._total_timesteps, self.n_envs * self._chunk()))
+        if self._pending is not None:  # the last call ended between a step and its storing: that step never was
+            self.rng.bit_generator.state = self._pending.rng_state
+            self._last_obs = None
+        resumed = not reset_num_timesteps and self._restore_env()
+        goes_on = resumed or (not reset_num_timesteps and self._last_obs is not None)
+        total, callback = super()._setup_learn(
+            total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
+        )
+        assert isinstance(self._last_obs, dict)
+        if not goes_on:
+            check_finite(self._last_obs, self.num_timesteps)
+            self._begin_episodes()
+            self.store.cut()
+            self.visited.cut(self.n_envs)
+            self.curriculum.cut(self.n_envs)
+            self._assign_missions()
+        return total, callback
+
+    def _chunk(self) -> int:
+        return self.train_freq.frequency if self.train_freq.unit.value == "step" else 0  # type: ignore[union-attr]
+
+    def _assign_missions(self) -> None:
+        assert isinstance(self._last_obs, dict)
+        points = rows(self._last_obs, "achieved_goal")
+        for i in range(self.n_envs):
+            self.curriculum.assign(i, points[i])
+
+    def _sample_action(
+        self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Let the running options act, with noise; nothing is kept until the step is stored."""
+        assert isinstance(self._last_obs, dict)
+        rng_state = self.rng.bit_generator.state
+        observation = {key: rows(self._last_obs, key) for key in KEYS}
+        requests = [mission.request for mission in self.curriculum.missions]
+        scaled, aims, state = self.controller.act(observation, self._state, requests)
+        scaled, held, hold_left = self._explore(scaled, learning_starts, action_noise)
+        self._pending = _Pending(observation, scaled, aims, state, held, hold_left, rng_state)
+        return self._factory.unscale(scaled).reshape((n_envs, *self._action_space().shape)), scaled
+
+    def _explore(
+        self, scaled: np.ndarray, learning_starts: int, action_noise: ActionNoise | None
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Add noise, or replace an action by a random one that is held for some steps."""
+        if action_noise is not None:
+            scaled = scaled + action_noise()
+        elif self._exploration_noise:
+            scaled = scaled + self.rng.normal(0.0, self._exploration_noise, scaled.shape)
+        held, hold_left = self._held_actions.copy(), self._hold_left.copy()
+        for i, mission in enumerate(self.curriculum.missions):
+            walking = mission.random_walk or self.num_timesteps < learning_starts
+            if hold_left[i] == 0 and (walking or self.rng.random() < self._random_action_prob / self._random_hold):
+                held[i] = self.rng.uniform(-1.0, 1.0, held[i].shape)
+                hold_left[i] = self.rng.integers(1, 2 * self._random_hold)
+            if hold_left[i] > 0:
+                scaled[i] = held[i]
+                hold_left[i] -= 1
+        return np.clip(scaled, -1.0, 1.0).astype(np.float32), held, hold_left
+
+    def _store_transition(
+        self,
+        replay_buffer: ReplayBuffer,
+        buffer_action: np.ndarray,
+        new_obs: np.ndarray | dict[str, np.ndarray],
+        reward: np.ndarray,
+        dones: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        """Store the step once, and let everything learn from it."""
+        assert isinstance(new_obs, dict)
+        reached = _with_terminal(new_obs, dones, infos)
+        check_finite(reached, self.num_timesteps)
+        check_finite(new_obs, self.num_timesteps)
+        with uninterrupted():
+            self._learn_from_step(reached, dones, infos)
+            self._last_obs = new_obs
+            self._last_original_obs = new_obs
+            self._pending = None
+            self._assign_missions()
+
+    def _learn_from_step(self, reached: dict[str, np.ndarray], dones: np.ndarray, infos: list[dict[str, Any]]) -> None:
+        step = self._pending
+        assert step is not None
+        before, points = step.observation["achieved_goal"], rows(reached, "achieved_goal")
+        truncated = np.array([info.get("TimeLimit.truncated", False) for info in infos])
+        row = self.store.add(
+            step.observation["observation"],
+            before,
+            rows(reached, "observation"),
+            points,
+            step.action,
+            step.aims,
+            dones & ~truncated,
+            dones,
+        )
+        requests = [mission.request for mission in self.curriculum.missions]
+        self._held_actions, self._hold_left = step.held_actions, step.hold_left
+        self._state, outcomes = self.controller.advance(step.state, points, requests)
+        by_env = {outcome.env: outcome for outcome in outcomes}
+        self._executed = sorted({int(index) for index in step.state.option})
+        for i in range(self.n_envs):
+            index = int(step.state.option[i])
+            if index != GLOBAL:
+                self.controller.option(index).replay.add_rows(row[i : i + 1])
+            self.visited.record(i, self.num_timesteps, points[i], bool(dones[i]))
+            if self.curriculum.observe(i, before[i], points[i], by_env.get(i), bool(dones[i])):
+                self._state.option[i] = UNDECIDED
+                self._state.failures[i], self._state.avoid[i] = 0, -1
+            if dones[i]:
+                self._hold_left[i] = 0
+
+    def train(self, gradient_steps: int, batch_size: int = 100) -> None:
+        """
+        Spread minibatch updates over the global option and the options executed last.
+
+        :param gradient_steps: number of updates over all networks
+        :param batch_size: transitions in a minibatch
+        """
+        if len(self.store) < batch_size:
+            return  # loaded without its replay buffer: first gather some experience
+        executed = [self.controller.option(index) for index in self._executed if index != GLOBAL]
+        trainable = [option for option in executed if option.mature or not self._arguments["warm_start"]]
+        for _ in range(gradient_steps):
+            learner = self._next_learner(trainable).learner
+            learner._current_progress_remaining = self._current_progress_remaining
+            learner.train(1, batch_size)
+        self._n_updates += gradient_steps
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        for name, value in self.global_option.learner.logger.name_to_value.items():
+            if name != "train/n_updates":
+                self.logger.record(name, value)
+
+    def _next_learner(self, trainable: list[Option]) -> Option:
+        """Take turns: a share of the updates to the global option, the rest to what was executed."""
+        self._credit += self._arguments["global_update_fraction"]
+        if self._credit >= 1.0 or not trainable:
+            self._credit -= min(self._credit, 1.0)
+            return self.global_option
+        return trainable[self._n_updates % len(trainable)]
+
+    def dump_logs(self) -> None:
+        """Write SB3's log entry, and the state of the graph under ``skillgraph/``."""
+        for name, value in self.graph_summary().items():
+            self.logger.record(f"skillgraph/{name}", value)
+        super().dump_logs()
+
+    def graph_summary(self) -> dict[str, float]:
+        """Describe the graph in numbers.
+
+        :return: ``events``; ``options`` (mature) and ``edges``; ``joined_pairs``, the share of ordered event pairs
+            joined by a path; ``coverage``, the share of visited states from which some vertex can be entered;
+            ``success_rate``, the mean over the options
+        """
+        options = list(self.graph.options.values())
+        rates = [option.success_rate(self.graph.rate_prior) for option in options]
+        return {
+            "events": len(self.graph.events),
+            "options": len(options),
+            "edges": self.graph.nx.number_of_edges(),
+            "joined_pairs": self.graph.joined_pairs(),
+            "coverage": self.planner.coverage(),
+            "success_rate": float(np.mean(rates)) if rates else 0.0,
+        }
+
+    # -- acting -------------------------------------------------------------------------------------------------------
+
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """
+        Act towards ``observation["desired_goal"]``: over the graph where a path leads, straight on where none does.
+
+        Pass the returned state back in, as with SB3's recurrent policies: it holds the running option. Without it an
+        option is chosen anew at every step, which still makes progress but plans a thousand times.
+
+        :param observation: one Dict observation, or a batch with a leading axis
+        :param state: what the last call returned; arrays of shape ``(n_envs,)``
+        :param episode_start: where an episode begins, and the state is forgotten; shape ``(n_envs,)``
+        :param deterministic: not used: no noise is added either way
+        :return: actions in the environment's own bounds, and the state
+        :raises ValueError: if the observation does not fit the observation space
+        """
+        batch, vectorized = self._batch(observation)
+        n_envs = len(batch["achieved_goal"])
+        running = ControllerState.fresh(n_envs) if state is None else ControllerState(*state).copy()
+        if episode_start is not None:
+            fresh = ControllerState.fresh(n_envs)
+            running = ControllerState(
+                *(np.where(np.asarray(episode_start, dtype=bool), new, old) for new, old in zip(fresh, running, strict=True))
+            )
+        requests = [Request(goal) for goal in batch["desired_goal"]]
+        running, _ = self.controller.advance(running, batch["achieved_goal"], requests)
+        scaled, _, running = self.controller.act(batch, running, requests)
+        actions = self._factory.unscale(scaled).reshape((n_envs, *self._action_space().shape))
+        return (actions if vectorized else actions[0]), tuple(running)
+
+    def _batch(self, observation: np.ndarray | dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], bool]:
+        if not isinstance(observation, dict) or any(key not in observation for key in KEYS):
+            raise ValueError(f"predict needs a Dict observation with {', '.join(KEYS)}, not {type(observation).__name__}.")
+        space = self.observation_space
+        assert isinstance(space, spaces.Dict)
+        given = np.shape(observation["achieved_goal"])
+        expected = space["achieved_goal"].shape
+        assert expected is not None
+        vectorized = len(given) > len(expected)
+        batch = {}
+        for key in KEYS:
+            array = np.asarray(observation[key], dtype=np.float32)
+            shape = space[key].shape
+            if array.shape[int(vectorized) :] != shape:
+                raise ValueError(f"{key!r} has shape {array.shape}; expected {shape}, or the same with a leading axis.")
+            batch[key] = array.reshape(len(array) if vectorized else 1, -1)
+        return batch, vectorized
+
+    def plan(self, obs: dict[str, np.ndarray], goal: np.ndarray | None = None) -> Plan:
+        """
+        Tell how the agent would go about a goal (section 3.3, Figure 2).
+
+        :param obs: one observation
+        :param goal: the goal, shape ``(goal_dim,)``; by default ``obs["desired_goal"]``
+        :return: which of the paper's three cases holds, and the path
+        :raises ValueError: if the goal is not a finite vector of goal space
+        """
+        batch, _ = self._batch(obs)
+        target = batch["desired_goal"][0] if goal is None else self._checked_goal(goal)
+        return self.planner.plan(batch["achieved_goal"][0], target, self.event_radius)
+
+    def _checked_goal(self, goal: np.ndarray) -> np.ndarray:
+        assert self._spec is not None
+        array = np.asarray(goal, dtype=np.float64)
+        if array.shape != (self._spec.goal_dim,) or not np.isfinite(array).all():
+            raise ValueError(f"A goal must be a finite vector of shape ({self._spec.goal_dim},), not {goal!r}.")
+        return array
+
+    def adapt(
+        self: SelfSkillGraphAgent,
+        goal: np.ndarray,
+        *,
+        start: np.ndarray | None = None,
+        total_timesteps: int = 10_000,
+        callback: MaybeCallback = None,
+    ) -> SelfSkillGraphAgent:
+        """
+        Learn to reach a goal the graph does not reach yet (section 3.3, cases b and c).
+
+        The goal becomes a salient event, joined to the vertex nearest to it by a chain whose options start from what
+        is known already; for ``total_timesteps`` the agent pursues nothing else.
+
+        :param goal: shape ``(goal_dim,)``
+        :param start: where episodes begin meanwhile, for environments whose ``reset`` takes ``options={"start": ...}``
+        :param total_timesteps: environment steps
+        :param callback: SB3 callback(s)
+        :return: the agent
+        :raises ValueError: if the goal or the start is not a finite vector of goal space
+        """
+        target = self._checked_goal(goal)
+        assert self.env is not None, "Give the agent an environment (set_env) before adapt."
+        options: dict[str, Any] = {} if start is None else {"start": self._checked_goal(start)}
+        self._last_obs = None
+        try:
+            for _ in range(self.n_envs):
+                self.env.set_options(options)
+            self.curriculum.pin(target)
+            return self.learn(total_timesteps, callback, log_interval=None, reset_num_timesteps=False)
+        finally:
+            self.curriculum.pinned = None
+            self.env.set_options()
+
+
+class _Pending:
+    """A step between its taking and its storing."""
+
+    def __init__(
+        self,
+        observation: dict[str, np.ndarray],
+        action: np.ndarray,
+        aims: np.ndarray,
+        state: ControllerState,
+        held_actions: np.ndarray,
+        hold_left: np.ndarray,
+        rng_state: Any,
+    ) -> None:
+        self.observation = observation
+        self.action = action
+        self.aims = aims
+        self.state = state
+        self.held_actions = held_actions
+        self.hold_left = hold_left
+        self.rng_state = rng_state
+
+
+def _with_terminal(new_obs: dict[str, np.ndarray], dones: np.ndarray, infos: list[dict[str, Any]]) -> dict[str, np.ndarray]:
+    """Put the observations that ended episodes back in place of those that began the next ones."""
+    if not dones.any():
+        return new_obs
+    reached = {key: np.array(value) for key, value in new_obs.items()}
+    for i in np.flatnonzero(dones):
+        for key in reached:
+            reached[key][i] = infos[i]["terminal_observation"][key]
+    return reached
+
+
+def _refuse(
+    replay_buffer_class: Any, replay_buffer_kwargs: Any, optimize_memory_usage: bool, n_steps: int, use_sde: bool
+) -> None:
+    reasons = {
+        "replay_buffer_class": (replay_buffer_class is not None, "all options learn from views of one shared store"),
+        "replay_buffer_kwargs": (bool(replay_buffer_kwargs), "all options learn from views of one shared store"),
+        "optimize_memory_usage": (optimize_memory_usage, "the shared store is as small as it can be"),
+        "n_steps": (n_steps != 1, "rewards are recomputed per option, one step at a time"),
+        "use_sde": (use_sde, "options explore with action noise"),
+    }
+    for name, (given, reason) in reasons.items():
+        if given:
+            raise ValueError(f"SkillGraphAgent does not take {name}: {reason}.")

@@ -1,0 +1,176 @@
+"""Deep skill chaining: options learned backwards from an event until one can start where it must (sections 2.2, 3.2.5)."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from sb3_skillgraph.events import SalientEvent, TerminationSet
+from sb3_skillgraph.graph import SkillGraph
+from sb3_skillgraph.options.option import Option
+
+MakeOption = Callable[[str, TerminationSet], Option]
+
+
+@dataclass
+class SkillChain:
+    """Options that lead from one event to another, the last step first.
+
+    :param id: its name
+    :param source: id of the event it starts from
+    :param target: id of the event it leads to
+    :param options: ids of its options: the first (the root) ends in the target event, each next one in the initiation
+        set of the one before
+    :param complete: whether its last option can be started from the source event
+    :param n_failures: timed-out runs since the last success
+    :param dropped: whether it has been given up as hopeless
+    """
+
+    id: str
+    source: str
+    target: str
+    options: list[str] = field(default_factory=list)
+    complete: bool = False
+    n_failures: int = 0
+    dropped: bool = False
+
+    @property
+    def open(self) -> bool:
+        """Whether there is still something to learn."""
+        return not (self.complete or self.dropped)
+
+
+class DeepSkillChaining:
+    """Opens chains, lets their options gestate, and closes them.
+
+    :param graph: the skill graph, which mature options join
+    :param make_option: makes a gestating option for a target id and a termination set
+    :param on_maturity: called with an option the moment it matures (it then takes over the global policy)
+    :param gestation_period: successes an option needs to mature
+    :param max_failures: timed-out runs in a row after which a chain is given up; None for never
+    """
+
+    def __init__(
+        self,
+        graph: SkillGraph,
+        make_option: MakeOption,
+        on_maturity: Callable[[Option], None],
+        gestation_period: int,
+        max_failures: int | None,
+    ) -> None:
+        self.graph = graph
+        self.make_option = make_option
+        self.on_maturity = on_maturity
+        self.gestation_period = gestation_period
+        self.max_failures = max_failures
+        self.chains: dict[str, SkillChain] = {}
+        self.options: dict[str, Option] = {}
+        self.chain_of: dict[str, SkillChain] = {}
+
+    def open_chain(self, source: SalientEvent, target: SalientEvent) -> SkillChain:
+        """Start (or take up again) the chain between two events.
+
+        :param source: where it must be possible to start
+        :param target: where it must lead
+        :return: the chain
+        """
+        id = f"{source.id}>{target.id}"
+        if id not in self.chains:
+            chain = self.chains[id] = SkillChain(id, source.id, target.id)
+            self._grow(chain, target.id, target)
+        chain = self.chains[id]
+        if chain.dropped:
+            chain.dropped, chain.n_failures = False, 0
+        return chain
+
+    def _grow(self, chain: SkillChain, target: str, termination: TerminationSet) -> None:
+        option = self.make_option(target, termination)
+        self.options[option.id] = option
+        self.chain_of[option.id] = chain
+        chain.options.append(option.id)
+
+    def open_chains(self) -> list[SkillChain]:
+        """Return the chains that still need practice."""
+        return [chain for chain in self.chains.values() if chain.open]
+
+    def admissible(self, chain: SkillChain, point: np.ndarray) -> Option:
+        """Return the option to run on the way to a chain's target: the earliest one that can start (section 3.2.5).
+
+        Earliest means nearest to the target. A gestating option may start anywhere: that is how it finds out where
+        it should.
+
+        :param chain: the chain
+        :param point: where the agent stands, shape ``(goal_dim,)``
+        """
+        options = [self.options[id] for id in chain.options]
+        for option in options:
+            startable = not option.mature or bool(option.initiation.optimistic(point[None])[0])
+            if startable and not option.terminates(point[None])[0]:
+                return option
+        return options[-1]
+
+    def learn_success(self, option: Option, path: np.ndarray, end: np.ndarray, *, own: bool = True) -> None:
+        """Let an option learn from a run that reached its termination set.
+
+        :param option: the option
+        :param path: the states of the run, its start first, shape ``(n, goal_dim)``
+        :param end: the state it ended in, shape ``(goal_dim,)``
+        :param own: whether the option itself was running
+        """
+        option.succeeded(path, end, own=own)
+        self.chain_of[option.id].n_failures = 0
+        self._learned(option, path[0], success=True)
+
+    def learn_failure(self, option: Option, start: np.ndarray) -> None:
+        """Let an option learn from a run that timed out.
+
+        :param option: the option
+        :param start: the state it began in, shape ``(goal_dim,)``
+        """
+        option.failed(start)
+        chain = self.chain_of[option.id]
+        chain.n_failures += 1
+        if self.max_failures is not None and chain.open and chain.n_failures >= self.max_failures:
+            chain.dropped = True
+        self._learned(option, start, success=False)
+
+    def _learned(self, option: Option, start: np.ndarray, success: bool) -> None:
+        chain = self.chain_of[option.id]
+        source = self.graph.events[chain.source]
+        for event in self.graph.events.values():
+            if event.id != option.target and event.contains(start[None])[0]:
+                self.graph.ran_from(event, option, success)
+        refitted = option.initiation.refit(force=not option.mature)
+        if option.mature:
+            self.graph.refresh(option, refitted)
+        elif option.n_successes >= self.gestation_period:
+            option.mature = True
+            self.graph.add_option(option)
+            self.on_maturity(option)
+        if option.mature:
+            self._check(chain, source)
+
+    def _check(self, chain: SkillChain, source: SalientEvent) -> None:
+        """Close a chain whose last option can be started from the source, or grow it by a child that leads there."""
+        last = self.options[chain.options[-1]]
+        chain.complete = any(self.graph.nx.has_edge(source.id, id) for id in chain.options)
+        if chain.complete or not last.mature:
+            return
+        tried = self.graph.evidence.get((source.id, last.id), ())
+        if not tried or (len(tried) >= self.gestation_period and sum(tried) * 2 < len(tried)):
+            self._grow(chain, last.id, last)
+
+    def get_state(self) -> dict[str, Any]:
+        """Return chains and the order of the options as plain data."""
+        return {"chains": [vars(chain) for chain in self.chains.values()], "options": list(self.options)}
+
+    def set_state(self, state: dict[str, Any], options: dict[str, Option]) -> None:
+        """Restore what :meth:`get_state` returned.
+
+        :param state: the state
+        :param options: the restored options by id
+        """
+        self.chains = {spec["id"]: SkillChain(**spec) for spec in state["chains"]}
+        self.options = {id: options[id] for id in state["options"]}
+        self.chain_of = {id: chain for chain in self.chains.values() for id in chain.options}

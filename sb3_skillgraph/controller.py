@@ -1,0 +1,249 @@
+"""Which option runs, for how long, and what it does: one environment step at a time (sections 3.2.4, 3.2.5, A.6)."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from sb3_skillgraph.chaining import DeepSkillChaining
+from sb3_skillgraph.events import SalientEvent, TerminationSet
+from sb3_skillgraph.options.execution import Fate, fate
+from sb3_skillgraph.options.numpy_actor import NumpyActor
+from sb3_skillgraph.options.option import Option
+from sb3_skillgraph.options.views import View
+from sb3_skillgraph.planner import GraphPlanner
+
+UNDECIDED, GLOBAL = -1, 0  # no option yet; the global option. Others follow, in the order of their making.
+
+
+class ControllerState(NamedTuple):
+    """All that must be remembered between two steps; arrays of shape ``(n_envs,)``.
+
+    :param option: index of the running option, or ``UNDECIDED``
+    :param steps: environment steps it has run
+    :param aim: index of the event the global option walks to, ``-1`` for the goal itself
+    :param failures: approaches to the goal that have failed
+    :param avoid: index of an option that has just failed, ``-1`` for none
+    """
+
+    option: np.ndarray
+    steps: np.ndarray
+    aim: np.ndarray
+    failures: np.ndarray
+    avoid: np.ndarray
+
+    @classmethod
+    def fresh(cls, n_envs: int) -> "ControllerState":
+        """Return the state at the start of an episode."""
+        undecided, zeros = np.full(n_envs, UNDECIDED), np.zeros(n_envs, dtype=np.int64)
+        return cls(undecided, zeros, np.full(n_envs, -1), zeros.copy(), np.full(n_envs, -1))
+
+    def copy(self) -> "ControllerState":
+        """Return a copy that shares no memory."""
+        return ControllerState(*(array.copy() for array in self))
+
+
+class Request(NamedTuple):
+    """What one environment's agent is to do.
+
+    :param goal: where to go, shape ``(goal_dim,)``
+    :param event: id of the event that is the goal; None for any other goal
+    :param chain: id of a skill chain to practise on the way; None at test time
+    :param left_graph: the chain's source has been reached, so that the chain itself takes over
+    :param direct: walk straight to the goal by the global option
+    """
+
+    goal: np.ndarray
+    event: str | None = None
+    chain: str | None = None
+    left_graph: bool = False
+    direct: bool = False
+
+
+class OptionOutcome(NamedTuple):
+    """The end of one run of an option: the only thing that changes statistics.
+
+    :param env: which environment
+    :param option: index of the option
+    :param aim: index of the event the global option walked to, ``-1`` for the goal itself
+    :param success: whether it reached its termination set; None if it was cut short
+    :param steps: environment steps it ran
+    """
+
+    env: int
+    option: int
+    aim: int
+    success: bool | None
+    steps: int
+
+
+class Controller:
+    """Runs options, choosing one whenever the last has ended; the same code while learning and in ``predict``.
+
+    It keeps nothing between calls: what must be remembered travels in :class:`ControllerState`.
+
+    :param global_option: the option that walks straight to any goal
+    :param chaining: all other options
+    :param planner: finds ways over the graph
+    :param view: what a policy sees
+    :param radius: the event radius, in goal units
+    :param timeout: environment steps an option may run; the global option, half of them
+    :param warm_start: whether gestating options act with the global option's policy
+
+    ``planning``: whether to use the graph at all; without it the global option walks straight to every goal.
+    """
+
+    def __init__(
+        self,
+        global_option: Option,
+        chaining: DeepSkillChaining,
+        planner: GraphPlanner,
+        view: View,
+        radius: float,
+        timeout: int,
+        warm_start: bool,
+    ) -> None:
+        self.global_option = global_option
+        self.chaining = chaining
+        self.planner = planner
+        self.view = view
+        self.radius = radius
+        self.timeout = timeout
+        self.warm_start = warm_start
+        self.planning = True
+
+    # -- options by number --------------------------------------------------------------------------------------------
+
+    def option(self, index: int) -> Option:
+        """Return an option by its index."""
+        return self.global_option if index == GLOBAL else self.chaining.options[f"o{index}"]
+
+    def index(self, option: Option) -> int:
+        """Return the index of an option."""
+        return GLOBAL if option is self.global_option else int(option.id[1:])
+
+    def event(self, index: int) -> SalientEvent:
+        """Return an event by its index."""
+        return self.planner.graph.events[f"e{index}"]
+
+    # -- one step -----------------------------------------------------------------------------------------------------
+
+    def advance(
+        self, state: ControllerState, points: np.ndarray, requests: Sequence[Request]
+    ) -> tuple[ControllerState, list[OptionOutcome]]:
+        """End the options that have reached their termination set or timed out.
+
+        :param state: the state after the step
+        :param points: where the agents stand, shape ``(n_envs, goal_dim)``
+        :param requests: what each is to do
+        :return: the state, undecided where an option ended; one outcome per option that ended
+        """
+        state, outcomes = state.copy(), []
+        for i in np.flatnonzero(state.option != UNDECIDED):
+            index, aim, steps = int(state.option[i]), int(state.aim[i]), int(state.steps[i])
+            timeout = self.timeout if index != GLOBAL else self.timeout // 2
+            ended = fate(self._termination(index, aim, requests[i]), points[i], steps, timeout)
+            if ended == Fate.RUNNING:
+                continue
+            success = ended == Fate.SUCCEEDED
+            outcomes.append(OptionOutcome(int(i), index, aim, success, steps))
+            state.option[i] = UNDECIDED
+            state.avoid[i] = -1 if success or index == GLOBAL else index
+            state.failures[i] += not success and index == GLOBAL
+        return state, outcomes
+
+    def _termination(self, index: int, aim: int, request: Request) -> TerminationSet:
+        if index != GLOBAL:
+            termination = self.option(index).termination
+            assert termination is not None
+            return termination
+        return self.event(aim) if aim >= 0 else SalientEvent("goal", request.goal, self.radius)
+
+    def act(
+        self,
+        observation: dict[str, np.ndarray],
+        state: ControllerState,
+        requests: Sequence[Request],
+    ) -> tuple[np.ndarray, np.ndarray, ControllerState]:
+        """Choose an option where none is running, and let the options act.
+
+        :param observation: ``observation`` and ``achieved_goal``, shapes ``(n_envs, dim)``
+        :param state: the state before the step
+        :param requests: what each agent is to do
+        :return: actions scaled to [-1, 1], shape ``(n_envs, action_dim)``; the points the options aim at, shape
+            ``(n_envs, goal_dim)``; the state after the step
+        """
+        state = state.copy()
+        points = observation["achieved_goal"]
+        for i in np.flatnonzero(state.option == UNDECIDED):
+            state.option[i], state.aim[i] = self.choose(points[i], requests[i], int(state.failures[i]), int(state.avoid[i]))
+            state.steps[i] = 0
+        aims = np.stack([self._aim(int(o), int(a), r) for o, a, r in zip(state.option, state.aim, requests, strict=True)])
+        seen = self.view(observation["observation"], points, aims)
+        actors = [self._actor(int(index)) for index in state.option]
+        if len(actors) == 1:
+            actions = actors[0].act(seen)
+        else:
+            actions = np.concatenate([actor.act(seen[i : i + 1]) for i, actor in enumerate(actors)])
+        state.steps[:] += 1
+        return actions, aims, state
+
+    def _actor(self, index: int) -> NumpyActor:
+        option = self.option(index)
+        gestates_with_global = self.warm_start and not option.mature
+        return (self.global_option if gestates_with_global else option).actor
+
+    def _aim(self, index: int, aim: int, request: Request) -> np.ndarray:
+        if index != GLOBAL:
+            return self.option(index).subgoal
+        return self.event(aim).center if aim >= 0 else request.goal
+
+    # -- choosing an option -------------------------------------------------------------------------------------------
+
+    def choose(self, point: np.ndarray, request: Request, failures: int, avoid: int) -> tuple[int, int]:
+        """Choose the option to run next.
+
+        :param point: where the agent stands, shape ``(goal_dim,)``
+        :param request: what it is to do
+        :param failures: approaches to the goal that have failed
+        :param avoid: index of an option that has just failed, ``-1`` for none
+        :return: index of the option; index of the event the global option is to walk to, ``-1`` for the goal
+        """
+        if request.direct or not self.planning:
+            return GLOBAL, -1
+        avoided = self.option(avoid).id if avoid > GLOBAL else None
+        if request.chain is not None:
+            return self._practise(point, request, avoided)
+        if request.event is not None:
+            return self._towards(point, request.event, avoided)
+        return self._to_goal(point, request.goal, failures, avoided)
+
+    def _practise(self, point: np.ndarray, request: Request, avoid: str | None) -> tuple[int, int]:
+        """Plan to the chain's source; from there on, the chain's earliest admissible option (section 3.2.5)."""
+        assert request.chain is not None
+        chain = self.chaining.chains[request.chain]
+        source = self.planner.graph.events[chain.source]
+        if request.left_graph or source.contains(point[None])[0]:
+            return self.index(self.chaining.admissible(chain, point)), -1
+        return self._towards(point, source.id, avoid)
+
+    def _towards(self, point: np.ndarray, event: str, avoid: str | None) -> tuple[int, int]:
+        """Follow the plan to an event; outside the graph, walk to where it can be entered."""
+        path = self.planner.path_to(point, event, avoid)
+        if path is not None:
+            return self.index(self.chaining.options[path.vertices[0]]), -1
+        entry = self.planner.entry(point, event)
+        return GLOBAL, self._event_index(entry.id if entry is not None else event)
+
+    def _to_goal(self, point: np.ndarray, goal: np.ndarray, failures: int, avoid: str | None) -> tuple[int, int]:
+        """Follow the cheapest way to a goal; after a failed approach, the next cheapest."""
+        legs = self.planner.legs(point, goal, avoid)
+        if legs:
+            path = legs[min(failures, len(legs) - 1)].path
+            return (GLOBAL, -1) if path is None else (self.index(self.chaining.options[path.vertices[0]]), -1)
+        nearest = self.planner.vertices_near(goal)
+        entry = self.planner.entry(point, nearest[0][0].id) if nearest else None
+        return GLOBAL, -1 if entry is None else self._event_index(entry.id)
+
+    def _event_index(self, id: str) -> int:
+        return int(id[1:])

@@ -1,0 +1,344 @@
+"""What the agent does while it learns: which target to pursue, and what each run teaches (sections 3.2.1-3.2.7)."""
+
+from dataclasses import asdict, dataclass
+from typing import Any, Literal, NamedTuple
+
+import networkx as nx
+import numpy as np
+
+from sb3_skillgraph.chaining import DeepSkillChaining, SkillChain
+from sb3_skillgraph.controller import GLOBAL, OptionOutcome, Request
+from sb3_skillgraph.events import SalientEvent
+from sb3_skillgraph.graph import SkillGraph
+from sb3_skillgraph.planner import GraphPlanner
+from sb3_skillgraph.salience.discovery import EventDiscovery
+from sb3_skillgraph.visited import VisitedStates
+
+
+class Strategy(NamedTuple):
+    """How targets are chosen; the fields are arguments of :class:`~sb3_skillgraph.SkillGraphAgent`, described there."""
+
+    target_choice: Literal["nearest", "uniform"]
+    practise_prob: float
+    explore_prob: float
+    exploration_steps: int
+    max_tries: int
+    link_reach: int
+    off_policy_runs: bool
+
+
+@dataclass
+class Mission:
+    """What one environment's agent is about.
+
+    :param goal: where to go, shape ``(goal_dim,)``
+    :param event: id of the target event; None for a point to explore towards
+    :param chain: id of the chain to practise
+    :param left_graph: whether the chain's source has been reached
+    :param explore_steps: steps of exploration to be done at the target event (or, without one, towards the goal)
+    :param random: whether exploration is a random walk rather than a walk towards a goal
+    :param n_failures: options that timed out during the mission
+    """
+
+    goal: np.ndarray
+    event: str | None = None
+    chain: str | None = None
+    left_graph: bool = False
+    explore_steps: int = 0
+    random: bool = False
+    n_failures: int = 0
+
+    @property
+    def request(self) -> Request:
+        """The mission as the controller sees it."""
+        return Request(self.goal, self.event, self.chain, self.left_graph, direct=self.event is None)
+
+    @property
+    def random_walk(self) -> bool:
+        """Whether actions are to be random now."""
+        return self.event is None and self.random
+
+
+class Curriculum:
+    """Gives every environment its missions, and turns outcomes into knowledge.
+
+    :param graph: the skill graph
+    :param chaining: the chains and their options
+    :param planner: finds ways over the graph
+    :param visited: the agent's trajectories
+    :param discovery: adds salient events
+    :param strategy: how targets are chosen
+    :param timeout: environment steps an option may run
+    :param rng: random generator
+    :param n_envs: number of environments
+    """
+
+    def __init__(
+        self,
+        graph: SkillGraph,
+        chaining: DeepSkillChaining,
+        planner: GraphPlanner,
+        visited: VisitedStates,
+        discovery: EventDiscovery,
+        strategy: Strategy,
+        timeout: int,
+        rng: np.random.Generator,
+        n_envs: int,
+    ) -> None:
+        self.graph = graph
+        self.chaining = chaining
+        self.planner = planner
+        self.visited = visited
+        self.discovery = discovery
+        self.strategy = strategy
+        self.timeout = timeout
+        self.rng = rng
+        self._missions: list[Mission | None] = [None] * n_envs
+        self.n_episodes = 0
+        self.pinned: str | None = None  # target of few-shot adaptation
+        self._paths: list[list[np.ndarray]] = [[] for _ in range(n_envs)]  # of the running option
+        self._since_event: list[list[np.ndarray]] = [[] for _ in range(n_envs)]  # since the last event was left
+        self._last_event: list[str | None] = [None] * n_envs
+
+    # -- one step -----------------------------------------------------------------------------------------------------
+
+    @property
+    def missions(self) -> list[Mission]:
+        """What each environment's agent is about."""
+        return [mission for mission in self._missions if mission is not None]
+
+    def assign(self, env: int, point: np.ndarray) -> None:
+        """Give an environment a mission if it has none, and note whether it stands where its chain begins.
+
+        :param env: which environment
+        :param point: where its agent stands, shape ``(goal_dim,)``
+        """
+        mission = self._missions[env]
+        if mission is None:
+            if not self.graph.events:
+                self._begin(point)
+            mission = self._missions[env] = self._choose(point)
+        if mission.chain is not None and not mission.left_graph:
+            source = self.graph.events[self.chaining.chains[mission.chain].source]
+            mission.left_graph = bool(source.contains(point[None])[0])
+
+    def cut(self, n_envs: int) -> None:
+        """Forget what every environment was in the middle of: they have been reset.
+
+        :param n_envs: number of environments from now on
+        """
+        self._missions = [None] * n_envs
+        self._paths = [[] for _ in range(n_envs)]
+        self._since_event = [[] for _ in range(n_envs)]
+        self._last_event = [None] * n_envs
+
+    def pin(self, goal: np.ndarray) -> None:
+        """Pursue one goal and nothing else, until ``pinned`` is set to None (section 3.3).
+
+        :param goal: shape ``(goal_dim,)``
+        """
+        event = self.planner.event_at(goal)
+        if event is None or np.linalg.norm(event.center - goal) > 0.5 * event.radius:
+            event = self.discovery.add(goal)
+            self._join(event)
+        self.pinned = event.id
+
+    def _begin(self, point: np.ndarray) -> None:
+        """The first event is where the agent starts (section 3.2.7 calls it beta_0)."""
+        event = self.discovery.add(point)
+        self.discovery.newest = event.id
+        self._events_changed()
+
+    def _events_changed(self) -> None:
+        events = list(self.graph.events.values())
+        self.visited.set_events(np.stack([e.center for e in events]), np.array([e.radius for e in events]))
+
+    def observe(
+        self, env: int, before: np.ndarray, after: np.ndarray, outcome: OptionOutcome | None, done: bool
+    ) -> bool:
+        """Learn from one environment step.
+
+        :param env: which environment
+        :param before: where its agent stood, shape ``(goal_dim,)``
+        :param after: where it stands now (the last state of the episode, if it ended)
+        :param outcome: what became of the option it ran, if that ended
+        :param done: whether the episode ended
+        :return: whether the running option must be cut short, since the mission has changed
+        """
+        self._paths[env].append(before)
+        self._track_events(env, before, after)
+        mission = self._missions[env]
+        assert mission is not None
+        if outcome is not None:
+            self._learn(env, outcome, after)
+            mission.n_failures += not outcome.success
+        over = self._mission_over(mission, after)
+        if over or done:
+            self._missions[env] = None
+        if outcome is not None or over or done:
+            self._paths[env] = []
+        if done:
+            self.n_episodes += 1
+            self._since_event[env], self._last_event[env] = [], None
+        return over or done
+
+    def _learn(self, env: int, outcome: OptionOutcome, end: np.ndarray) -> None:
+        if outcome.option == GLOBAL:
+            return
+        option = self.chaining.options[f"o{outcome.option}"]
+        path = np.stack(self._paths[env])
+        if outcome.success:
+            self.chaining.learn_success(option, path, end)
+        else:
+            self.chaining.learn_failure(option, path[0])
+
+    def _mission_over(self, mission: Mission, point: np.ndarray) -> bool:
+        """Whether a mission has ended; an exploration begins at its event, and ends after its steps."""
+        if mission.event is None:
+            mission.explore_steps -= 1
+            return mission.explore_steps <= 0
+        if self.graph.events[mission.event].contains(point[None])[0]:
+            if mission.explore_steps <= 0:
+                return True
+            mission.event, mission.n_failures = None, 0
+            return False
+        return mission.n_failures >= self.strategy.max_tries
+
+    # -- events passed ------------------------------------------------------------------------------------------------
+
+    def _track_events(self, env: int, before: np.ndarray, after: np.ndarray) -> None:
+        """Note which events a trajectory passes: every crossing shows a way, whatever option was running."""
+        if self._last_event[env] is None:
+            here = self.planner.event_at(before)
+            self._last_event[env] = None if here is None else here.id
+        if len(self._since_event[env]) > self.timeout:
+            self._since_event[env], self._last_event[env] = [], None
+        self._since_event[env].append(before)
+        event = self.planner.event_at(after)
+        if event is None:
+            return
+        previous = self._last_event[env]
+        if event.id != previous:
+            self.graph.triggered(event, after)
+            if previous is not None:
+                self._crossed(env, self.graph.events[previous], event, after)
+        self._last_event[env], self._since_event[env] = event.id, []
+
+    def _crossed(self, env: int, source: SalientEvent, target: SalientEvent, end: np.ndarray) -> None:
+        path = np.stack(self._since_event[env])
+        chain = self.chaining.chains.get(f"{source.id}>{target.id}")
+        if chain is None:
+            if len(path) <= self.strategy.link_reach and self._detour(source, target):
+                self.chaining.open_chain(source, target)
+        elif self.strategy.off_policy_runs and not self.chaining.options[chain.options[0]].mature:
+            self.chaining.learn_success(self.chaining.options[chain.options[0]], path, end, own=False)
+
+    def _detour(self, source: SalientEvent, target: SalientEvent) -> bool:
+        """Whether the graph knows no way between two events, or only one by way of others."""
+        path = self.graph.shortest_path([source.id], target.id)
+        return path is None or len(path.vertices) > 3
+
+    # -- choosing a mission -------------------------------------------------------------------------------------------
+
+    def _choose(self, point: np.ndarray) -> Mission:
+        if self.pinned is not None:
+            return self._to_event(point, self.graph.events[self.pinned])
+        connected = self.connected()
+        if self.discovery.due(self.n_episodes, connected):
+            for event in self.discovery.attempt(self.n_episodes, self.rng):
+                self._join(event)
+        if self.strategy.target_choice == "uniform":
+            return self._uniform(point)
+        draw = self.rng.random()
+        if draw < self.strategy.explore_prob:
+            return self._explore()
+        if draw < self.strategy.explore_prob + self.strategy.practise_prob and len(connected) > 1:
+            return self._mission(self.graph.events[sorted(connected)[self.rng.integers(len(connected))]], None)
+        chain = self._nearest_chain(point)
+        return self._explore() if chain is None else self._mission(self.graph.events[chain.target], chain)
+
+    def _join(self, event: SalientEvent) -> None:
+        """Open the chains that are to join a new event to the graph, there and back (sections 3.2.5, 3.2.7, A.3)."""
+        self._events_changed()
+        source = next((v for v, _ in self.planner.vertices_near(event.center) if v.id != event.id), None)
+        if source is None:
+            source = self.graph.events["e0"]
+        self.chaining.open_chain(source, event)
+        if self.strategy.target_choice == "nearest":
+            self.chaining.open_chain(event, source)
+
+    def connected(self) -> set[str]:
+        """Return the ids of the events that a path leads to from the first."""
+        return {"e0"} | (nx.descendants(self.graph.nx, "e0") & self.graph.events.keys()) if self.graph.events else set()
+
+    def _mission(self, event: SalientEvent, chain: SkillChain | None) -> Mission:
+        return Mission(event.center, event.id, None if chain is None else chain.id)
+
+    def _to_event(self, point: np.ndarray, event: SalientEvent) -> Mission:
+        """Pursue an event: over the graph if a path leads there, else by the chain from the vertex nearest to it."""
+        if event.contains(point[None])[0]:
+            return self._explore()
+        if self.planner.path_to(point, event.id) is not None:
+            return self._mission(event, None)
+        chains = [c for c in self.chaining.chains.values() if c.target == event.id and c.open]
+        return self._mission(event, chains[0] if chains else None)
+
+    def _uniform(self, point: np.ndarray) -> Mission:
+        """Any event, each as likely (section 3.2.2); backward chains open when forward ones are complete (A.3)."""
+        for chain in list(self.chaining.chains.values()):
+            if chain.complete:
+                self.chaining.open_chain(self.graph.events[chain.target], self.graph.events[chain.source])
+        events = [event for event in self.graph.events.values() if not event.contains(point[None])[0]]
+        if not events:
+            return self._explore()
+        return self._to_event(point, events[self.rng.integers(len(events))])
+
+    def _nearest_chain(self, point: np.ndarray) -> SkillChain | None:
+        """Return the open chain whose source is cheapest to reach (ties: the one practised least)."""
+
+        def cost(chain: SkillChain) -> tuple[float, int]:
+            source = self.graph.events[chain.source]
+            if source.contains(point[None])[0]:
+                return 0.0, chain.n_failures
+            path = self.planner.path_to(point, chain.source)
+            return (float("inf") if path is None else path.cost), chain.n_failures
+
+        here = self.graph.events
+        chains = [c for c in self.chaining.open_chains() if not here[c.target].contains(point[None])[0]]
+        return min(chains, key=cost, default=None)
+
+    def _explore(self) -> Mission:
+        """Go to the event nearest to a random point, and on from there: towards the point, or at random.
+
+        It is the RRT's way to extend the tree (section 2.4), by skills instead of a model.
+        """
+        if self.visited.size < 2:
+            return Mission(self.graph.events["e0"].center, None, explore_steps=self.strategy.exploration_steps, random=True)
+        points = self.visited.points
+        margin = 4.0 * self.discovery.radius
+        goal = self.rng.uniform(points.min(axis=0) - margin, points.max(axis=0) + margin)
+        nearest = min(self.graph.events.values(), key=lambda event: float(np.linalg.norm(event.center - goal)))
+        return Mission(
+            goal, nearest.id, explore_steps=self.strategy.exploration_steps, random=bool(self.rng.random() < 0.5)
+        )
+
+    # -- saving -------------------------------------------------------------------------------------------------------
+
+    def get_state(self) -> dict[str, Any]:
+        """Return missions, paths and counters as plain data."""
+        return {
+            "missions": [None if mission is None else asdict(mission) for mission in self._missions],
+            "n_episodes": self.n_episodes,
+            "pinned": self.pinned,
+            "paths": self._paths,
+            "since_event": self._since_event,
+            "last_event": self._last_event,
+        }
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Restore what :meth:`get_state` returned."""
+        self._missions = [None if spec is None else Mission(**spec) for spec in state["missions"]]
+        self.n_episodes, self.pinned = state["n_episodes"], state["pinned"]
+        self._paths, self._since_event = state["paths"], state["since_event"]
+        self._last_event = state["last_event"]
+        self._events_changed()

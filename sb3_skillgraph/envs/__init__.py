@@ -1,0 +1,48 @@
+"""Maze tasks for skill graphs; importing this package registers ``SkillGraph/*`` with Gymnasium."""
+
+from typing import Any
+
+import gymnasium as gym
+
+from sb3_skillgraph.envs.maze_geometry import LARGE_MAZE, MEDIUM_MAZE, OPEN_AREA, U_MAZE, MazeGeometry, MazeMap
+from sb3_skillgraph.envs.task import GoalTask
+from sb3_skillgraph.envs.toy import ToyMazeEnv
+
+__all__ = [
+    "LARGE_MAZE",
+    "MEDIUM_MAZE",
+    "OPEN_AREA",
+    "U_MAZE",
+    "GoalTask",
+    "MazeGeometry",
+    "MazeMap",
+    "ToyMazeEnv",
+    "register",
+]
+
+# Entry points are names: MuJoCo is imported when an environment that needs it is made.
+_POINT = "sb3_skillgraph.envs.mujoco_mazes:PointMazeEnv"
+_ANT = "sb3_skillgraph.envs.mujoco_mazes:AntMazeEnv"
+_TOY = "sb3_skillgraph.envs.toy:ToyMazeEnv"
+_TASKS: dict[str, tuple[str, dict[str, Any]]] = {
+    "SkillGraph/PointMazeUMaze-v0": (_POINT, {"maze_map": U_MAZE}),
+    "SkillGraph/PointMazeMedium-v0": (_POINT, {"maze_map": MEDIUM_MAZE}),
+    "SkillGraph/PointMazeHard-v0": (_POINT, {"maze_map": LARGE_MAZE}),
+    "SkillGraph/PointMaze-v0": (_POINT, {}),
+    "SkillGraph/AntUMaze-v0": (_ANT, {"maze_map": U_MAZE}),
+    "SkillGraph/AntReacher-v0": (_ANT, {"maze_map": OPEN_AREA}),
+    "SkillGraph/ToyMaze-v0": (_TOY, {}),
+}
+
+
+def register() -> None:
+    """Register the ``SkillGraph/*`` environments with Gymnasium; those already there are left alone.
+
+    They bring their own time limit (``max_steps``), so that it is part of their state, and no ``max_episode_steps``.
+    """
+    for env_id, (entry_point, kwargs) in _TASKS.items():
+        if env_id not in gym.registry:
+            gym.register(env_id, entry_point=entry_point, kwargs=kwargs)
+
+
+register()

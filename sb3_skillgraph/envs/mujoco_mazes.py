@@ -1,0 +1,190 @@
+"""The point and the ant of gymnasium-robotics in mazes, as tasks with a free choice of start and goal."""
+
+import contextlib
+import io
+import tempfile
+import threading
+from abc import abstractmethod
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import mujoco
+import numpy as np
+from gymnasium.envs.mujoco import MujocoEnv
+from gymnasium.utils import EzPickle
+from numpy.typing import NDArray
+
+from sb3_skillgraph.envs.maze_geometry import MazeGeometry, MazeMap
+from sb3_skillgraph.envs.task import GoalTask, Observation
+
+# gymnasium-robotics prints a notice about its hand tasks to stderr when it is imported.
+with contextlib.redirect_stderr(io.StringIO()):
+    from gymnasium_robotics.envs.maze import ant_maze_v5, point_maze
+
+_POINT_CELL_SIZE, _ANT_CELL_SIZE = 1.0, 4.0
+_ANT_TORQUE = 30.0
+_ANT_FRAME_SKIP = 10
+_FULL_STATE = mujoco.mjtState.mjSTATE_INTEGRATION
+_temporary_directory_lock = threading.Lock()
+
+
+@contextlib.contextmanager
+def _private_temporary_directory() -> Iterator[None]:
+    """Make the temporary files of the block vanish at its end.
+
+    gymnasium-robotics 1.4.2 writes the model to a file named after the clock and leaves it there. In a directory of its
+    own no other process can write to the same name, and nothing stays behind whatever it is called.
+    """
+    with _temporary_directory_lock, tempfile.TemporaryDirectory(prefix="skillgraph_") as directory:
+        before, tempfile.tempdir = tempfile.tempdir, directory
+        try:
+            yield
+        finally:
+            tempfile.tempdir = before
+
+
+class _MujocoMazeTask(GoalTask, EzPickle):
+    """What the MuJoCo mazes share; comes before a maze environment of gymnasium-robotics in the list of bases."""
+
+    #: Moves the mark of the goal in the model; supplied by gymnasium-robotics.
+    update_target_site_pos: Callable[[], None]
+
+    @property
+    @abstractmethod
+    def _simulator(self) -> MujocoEnv:
+        """The environment of the body alone, which holds model and data."""
+
+    def _place(self, start: NDArray[np.float64]) -> None:
+        self.update_target_site_pos()
+        self._simulator.init_qpos[:2] = start
+        self._simulator.reset()
+
+    def _advance(self, action: NDArray[np.float32]) -> None:
+        self._simulator.step(action)
+
+    def _get_body_state(self) -> NDArray[np.float64]:
+        model = self._simulator.model
+        state = np.empty(mujoco.mj_stateSize(model, _FULL_STATE))
+        mujoco.mj_getState(model, self._simulator.data, state, _FULL_STATE)
+        return state
+
+    def _set_body_state(self, state: NDArray[np.float64]) -> None:
+        self.update_target_site_pos()
+        model, data = self._simulator.model, self._simulator.data
+        mujoco.mj_setState(model, data, state, _FULL_STATE)
+        mujoco.mj_forward(model, data)  # for what is derived from the state, such as what a renderer shows
+        mujoco.mj_setState(model, data, state, _FULL_STATE)  # before 3.3.6 mj_forward changes the warm start
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**EzPickle.__getstate__(self), "task_state": self.get_state()}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        EzPickle.__setstate__(self, state)
+        self.set_state(state["task_state"])
+
+
+class PointMazeEnv(_MujocoMazeTask, point_maze.PointMazeEnv):
+    """A ball pushed by forces in a maze of cells of 1 m.
+
+    Body, model and spaces are those of gymnasium-robotics' ``PointMaze-v3``: the observation is (x, y, vx, vy), the
+    action the force on both axes, a step 0.01 s.
+
+    :param maze_map: rows of cells, see :class:`~sb3_skillgraph.envs.maze_geometry.MazeGeometry`; required
+    :param render_mode: None or one of ``metadata["render_modes"]``
+    :param success_radius: distance to the goal that counts as success, in metres
+    :param max_steps: steps after which an episode is truncated
+    :param terminate_on_success: whether reaching the goal ends the episode
+    :raises ValueError: when an argument is unusable
+    """
+
+    metadata: dict[str, Any] = {  # noqa: RUF012 (as Gymnasium has it)
+        "render_modes": ["human", "rgb_array", "depth_array"],
+        "render_fps": 100,
+    }
+    option_view = "egocentric"
+    body_radius = 0.1
+    # Contacts are soft: the ball is this near to a wall when it hits it at full speed, and may start there.
+    start_margin = 0.03
+
+    def __init__(
+        self,
+        maze_map: MazeMap | None = None,
+        render_mode: str | None = None,
+        success_radius: float = 0.45,
+        max_steps: int = 1000,
+        terminate_on_success: bool = False,
+    ) -> None:
+        geometry = _make_geometry(maze_map, _POINT_CELL_SIZE)
+        with _private_temporary_directory():
+            super().__init__(maze_map=geometry.maze_map, render_mode=render_mode)
+        self._init_task(geometry, success_radius, max_steps, terminate_on_success)
+        EzPickle.__init__(self, maze_map, render_mode, success_radius, max_steps, terminate_on_success)
+
+    @property
+    def _simulator(self) -> MujocoEnv:
+        return self.point_env
+
+    def _observe(self) -> Observation:
+        return self._get_obs(self.point_env._get_obs()[0])
+
+
+class AntMazeEnv(_MujocoMazeTask, ant_maze_v5.AntMazeEnv):
+    """The four-legged ant in a maze of cells of 4 m.
+
+    Body and model are those of gymnasium-robotics' ``AntMaze-v5`` without contact forces: the observation has 27
+    numbers (height, orientation as a quaternion, 8 joint angles, the torso's velocities, joint velocities) and leaves
+    out x and y, which are the achieved goal.
+
+    Torque and control period are those of D4RL's ant: an action in [-1, 1] is a torque in [-30, 30] instead of
+    [-150, 150], held for 0.1 s instead of 0.05 s (10 simulator steps of 0.01 s instead of 5). With the strong motors
+    random actions throw the ant on its back within seconds.
+
+    :param maze_map: rows of cells, see :class:`~sb3_skillgraph.envs.maze_geometry.MazeGeometry`; required
+    :param render_mode: None or one of ``metadata["render_modes"]``
+    :param success_radius: distance to the goal that counts as success, in metres
+    :param max_steps: steps of 0.1 s after which an episode is truncated
+    :param terminate_on_success: whether reaching the goal ends the episode
+    :raises ValueError: when an argument is unusable
+    """
+
+    metadata: dict[str, Any] = {  # noqa: RUF012 (as Gymnasium has it)
+        "render_modes": ["human", "rgb_array", "depth_array"],
+        "render_fps": 10,
+    }
+    option_view = "relative"
+    # The ant is always reset facing along x, its feet 0.88 m away from the centre on both axes.
+    body_radius = 0.9
+    start_margin = 0.9
+
+    def __init__(
+        self,
+        maze_map: MazeMap | None = None,
+        render_mode: str | None = None,
+        success_radius: float = 0.45,
+        max_steps: int = 1000,
+        terminate_on_success: bool = False,
+    ) -> None:
+        geometry = _make_geometry(maze_map, _ANT_CELL_SIZE)
+        with _private_temporary_directory():
+            super().__init__(
+                maze_map=geometry.maze_map,
+                render_mode=render_mode,
+                frame_skip=_ANT_FRAME_SKIP,
+                include_cfrc_ext_in_observation=False,
+            )
+        self.model.actuator_gear[:, 0] = _ANT_TORQUE
+        self._init_task(geometry, success_radius, max_steps, terminate_on_success)
+        EzPickle.__init__(self, maze_map, render_mode, success_radius, max_steps, terminate_on_success)
+
+    @property
+    def _simulator(self) -> MujocoEnv:
+        return self.ant_env
+
+    def _observe(self) -> Observation:
+        return self._get_obs(self.ant_env._get_obs())
+
+
+def _make_geometry(maze_map: MazeMap | None, cell_size: float) -> MazeGeometry:
+    if maze_map is None:
+        raise ValueError("maze_map is required, for example maze_map=[[1, 1, 1, 1], [1, 'r', 0, 1], [1, 1, 1, 1]]")
+    return MazeGeometry(maze_map, cell_size)

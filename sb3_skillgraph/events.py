@@ -1,0 +1,53 @@
+"""Salient events: the states an agent has decided are worth reaching."""
+
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+
+
+class TerminationSet(Protocol):
+    """Anything an option can end in: a salient event, or another option's initiation set."""
+
+    def contains(self, points: np.ndarray) -> np.ndarray:
+        """Tell which points of goal space lie inside.
+
+        :param points: float array of shape ``(n, goal_dim)``
+        :return: bool array of shape ``(n,)``
+        """
+
+
+@dataclass(frozen=True, eq=False)
+class SalientEvent:
+    """A ball in goal space that the agent treats as a target of its own (section 3.1).
+
+    :param id: name of the event, and of its vertex in the skill graph
+    :param center: centre of the ball, shape ``(goal_dim,)``, in the environment's goal units
+    :param radius: radius of the ball, same units
+    :raises ValueError: if the centre is not a finite vector or the radius is not positive
+    """
+
+    id: str
+    center: np.ndarray
+    radius: float
+
+    def __post_init__(self) -> None:
+        center = np.asarray(self.center, dtype=np.float64)
+        if center.ndim != 1 or not np.isfinite(center).all():
+            raise ValueError(f"Event {self.id!r} needs a finite centre of shape (goal_dim,), not {self.center!r}.")
+        if not self.radius > 0:
+            raise ValueError(f"Event {self.id!r} needs a positive radius, not {self.radius!r}.")
+        object.__setattr__(self, "center", center)
+
+    def contains(self, points: np.ndarray) -> np.ndarray:
+        """Tell which points trigger the event.
+
+        :param points: float array of shape ``(n, goal_dim)``
+        :return: bool array of shape ``(n,)``
+        """
+        offsets = np.asarray(points, dtype=np.float64) - self.center
+        return np.einsum("ij,ij->i", offsets, offsets) <= self.radius**2
+
+    def get_state(self) -> dict[str, Any]:
+        """Return the event as plain data."""
+        return {"id": self.id, "center": self.center, "radius": self.radius}

@@ -1,0 +1,121 @@
+"""What the agent needs to know of a goal environment."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+from gymnasium import spaces
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_skillgraph.options.views import VIEWS, View
+
+KEYS = ("observation", "achieved_goal", "desired_goal")
+
+
+class GoalSpec(NamedTuple):
+    """Lengths of the flat observation, the goal and the action of a goal environment."""
+
+    observation_dim: int
+    goal_dim: int
+    action_dim: int
+
+    @classmethod
+    def of(cls, observation_space: spaces.Space, action_space: spaces.Space) -> "GoalSpec":
+        """Read the lengths off the spaces.
+
+        :param observation_space: the environment's
+        :param action_space: the environment's
+        :raises ValueError: if they are not those of a goal environment with Box actions
+        """
+        wanted = "a Dict observation space with Box entries 'observation', 'achieved_goal' and 'desired_goal'"
+        if not isinstance(observation_space, spaces.Dict) or any(key not in observation_space.spaces for key in KEYS):
+            raise ValueError(f"SkillGraphAgent needs a goal environment ({wanted}), not {observation_space}.")
+        boxes = [observation_space[key] for key in KEYS]
+        if not all(isinstance(box, spaces.Box) for box in boxes):
+            raise ValueError(f"SkillGraphAgent needs {wanted}; this environment has {observation_space}.")
+        shapes = [box.shape for box in boxes]
+        if shapes[1] != shapes[2] or shapes[1] is None or len(shapes[1]) != 1:
+            raise ValueError(
+                f"'achieved_goal' and 'desired_goal' must be vectors of the same length, not {shapes[1]} and {shapes[2]}."
+            )
+        if not isinstance(action_space, spaces.Box):
+            raise ValueError(f"SkillGraphAgent needs continuous actions (a Box action space), not {action_space}.")
+        if not (np.isfinite(action_space.low).all() and np.isfinite(action_space.high).all()):
+            raise ValueError(f"SkillGraphAgent needs an action space with finite bounds, not {action_space}.")
+        sizes = [int(np.prod(shape)) for shape in (shapes[0] or (), shapes[1], action_space.shape)]
+        return cls(*sizes)
+
+
+def rows(observation: dict[str, np.ndarray], key: str) -> np.ndarray:
+    """Return one entry of a batch of observations as float32 rows.
+
+    :param observation: Dict observation with a leading axis of environments
+    :param key: name of the entry
+    :return: shape ``(n_envs, dim)``
+    """
+    array = np.asarray(observation[key], dtype=np.float32)
+    return array.reshape(len(array), -1)
+
+
+def check_finite(observation: dict[str, np.ndarray], step: int) -> None:
+    """Refuse observations that hold NaN or inf.
+
+    :param observation: Dict observation with a leading axis of environments
+    :param step: number of environment steps taken so far
+    :raises ValueError: naming the entry, the environment and the step
+    """
+    for key in KEYS:
+        array = rows(observation, key)
+        if not np.isfinite(array).all():
+            env = int(np.flatnonzero(~np.isfinite(array).all(axis=1))[0])
+            raise ValueError(
+                f"{key!r} of environment {env} holds NaN or inf at step {step}: {array[env]}. The step was not stored; "
+                "the agent can still be saved, and learning can go on after the environment is mended."
+            )
+
+
+def env_attribute(env: VecEnv, name: str) -> Any:
+    """Return an attribute of the first environment, whatever wrappers lie around it; None if it has none."""
+    return env.get_attr(name, indices=0)[0] if env.has_attr(name) else None
+
+
+def find_view(view: str | View | None, env: VecEnv | None) -> tuple[str | None, View]:
+    """Return what a policy is to see.
+
+    :param view: name of a view, a function, or None for what the environment names (else ``"relative"``)
+    :param env: the environment
+    :return: the name (None for a function) and the function
+    :raises ValueError: if there is no view of that name
+    """
+    if view is None:
+        view = (env_attribute(env, "option_view") if env is not None else None) or "relative"
+    if callable(view):
+        return None, view
+    if view not in VIEWS:
+        raise ValueError(f"Unknown option_view {view!r}: use one of {sorted(VIEWS)} or a function.")
+    return view, VIEWS[view]
+
+
+class Oracle:
+    """The feasible-state oracle of an environment: its method ``sample_free(rng)``.
+
+    :param get_env: returns the VecEnv to ask (an agent's environment may be replaced)
+    :raises ValueError: if the environment has no such method
+    """
+
+    def __init__(self, get_env: Callable[[], VecEnv | None]) -> None:
+        self.get_env = get_env
+        env = get_env()
+        if env is not None and not env.has_attr("sample_free"):
+            raise ValueError(
+                "salience='rrt' needs a feasible-state oracle: an environment with a method sample_free(rng) that returns "
+                "a reachable point of goal space. Without one use salience='frontier'."
+            )
+
+    def __call__(self, rng: np.random.Generator) -> np.ndarray:
+        """Draw a feasible point, shape ``(goal_dim,)``."""
+        env = self.get_env()
+        assert env is not None, "salience='rrt' asks the environment; set_env first."
+        # The environment may live in another process, which gets a copy of the generator: give it one of its own.
+        child = np.random.default_rng(rng.integers(2**63))
+        return np.asarray(env.env_method("sample_free", child, indices=0)[0], dtype=np.float64)

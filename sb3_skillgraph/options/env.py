@@ -1,0 +1,100 @@
+"""An environment for one option by itself."""
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+
+from sb3_skillgraph.events import SalientEvent
+from sb3_skillgraph.options.execution import Fate, fate
+from sb3_skillgraph.options.initiation import InitiationSet
+from sb3_skillgraph.options.option import Option, termination_rule
+from sb3_skillgraph.options.views import VIEWS, ScaledView
+
+
+class OptionEnv(gym.Wrapper[np.ndarray, Any, dict[str, np.ndarray], Any]):
+    """A goal environment with the reward and the end of one option (section 2.1).
+
+    ``DDPG("MlpPolicy", OptionEnv(env, event)).learn(10_000)`` trains a policy for the option by itself. The reward is -1
+    a step and 0 on reaching the termination set, which ends the episode; after ``timeout`` steps it is truncated. The
+    next episode of the option goes on where the last one ended: the wrapped environment is reset only when its own
+    episode is over or has not begun.
+
+    :param env: a goal environment (Dict observations, Box actions)
+    :param termination: the salient event the option leads to, or the option into whose initiation set it leads
+    :param initiation: where the option can start; ``info["can_start"]`` tells after each reset whether it can
+    :param timeout: environment steps per run
+    :param goal: the point the policy aims at, shape ``(goal_dim,)``; by default that of the termination set
+    :raises ValueError: if the environment is no goal environment or the goal has the wrong shape
+    """
+
+    def __init__(
+        self,
+        env: gym.Env,
+        termination: SalientEvent | Option,
+        *,
+        initiation: InitiationSet | None = None,
+        timeout: int = 200,
+        goal: np.ndarray | None = None,
+    ) -> None:
+        super().__init__(env)
+        space = env.observation_space
+        if not isinstance(space, spaces.Dict) or "achieved_goal" not in space.spaces:
+            raise ValueError(
+                f"OptionEnv needs a goal environment: a Dict observation with 'observation', 'achieved_goal' and "
+                f"'desired_goal', not {space}."
+            )
+        self.termination = termination
+        self.initiation = initiation
+        self.timeout = timeout
+        if goal is None:
+            goal = termination.initiation.core if isinstance(termination, Option) else termination.center
+        self.goal = np.asarray(goal, dtype=np.float32)
+        if self.goal.shape != space["achieved_goal"].shape:
+            raise ValueError(f"The goal must have shape {space['achieved_goal'].shape}, not {self.goal.shape}.")
+        name = env.get_wrapper_attr("option_view") if env.has_wrapper_attr("option_view") else "relative"
+        self.view = ScaledView(VIEWS[name], termination.radius)
+        self.rule = termination_rule(termination, termination.radius)
+        dims = [int(np.prod(space[key].shape)) for key in ("observation", "achieved_goal")]  # type: ignore[arg-type]
+        self.observation_space = spaces.Box(-np.inf, np.inf, (self.view.dim(*dims),), np.float32)
+        self._last: dict[str, np.ndarray] | None = None
+        self._steps = 0
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
+        """Begin a run of the option where the last one ended.
+
+        :param seed: seeds the wrapped environment, which is then reset
+        :param options: passed to the wrapped environment, which is then reset
+        :return: what the policy sees, and ``info`` with ``can_start``
+        """
+        info: dict[str, Any] = {}
+        if self._last is None or seed is not None or options is not None:
+            self._last, info = self.env.reset(seed=seed, options=options)
+        self._steps = 0
+        point = np.asarray(self._last["achieved_goal"])[None]
+        info["can_start"] = self.initiation is None or bool(self.initiation.optimistic(point)[0])
+        return self._see(self._last), info
+
+    def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """Take one step; the reward and the end are the option's.
+
+        :param action: action of the wrapped environment
+        :return: what the policy sees, reward, whether the option succeeded, whether it was cut off, info
+        """
+        observation, _, terminated, truncated, info = self.env.step(action)
+        self._steps += 1
+        point = np.asarray(observation["achieved_goal"])
+        ended = fate(self.termination, point, self._steps, self.timeout)
+        success = ended == Fate.SUCCEEDED
+        self._last = None if terminated or truncated else observation
+        info["is_success"] = success
+        reward = float(self.rule.reward(np.array([success]))[0])
+        cut = not success and (ended == Fate.TIMED_OUT or truncated)
+        return self._see(observation), reward, success or terminated, cut, info
+
+    def _see(self, observation: dict[str, np.ndarray]) -> np.ndarray:
+        rows = [np.asarray(observation[key], dtype=np.float32).reshape(1, -1) for key in ("observation", "achieved_goal")]
+        return self.view(rows[0], rows[1], self.goal[None])[0]
+
+

@@ -1,0 +1,107 @@
+"""Building options: a headless SB3 model each, with a view of the shared store as its replay buffer."""
+
+from typing import Any
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+
+from sb3_skillgraph.events import TerminationSet
+from sb3_skillgraph.options.option import Option, goal_rule, termination_rule
+from sb3_skillgraph.options.views import ScaledView
+from sb3_skillgraph.replay import OptionReplay, TransitionStore
+
+
+class OptionFactory:
+    """Makes options that share a store, a view and their hyper-parameters.
+
+    :param option_class: SB3 off-policy class of every option's policy: ``OptionDDPG``, ``TD3``, ``SAC``, ...
+    :param option_kwargs: its keyword arguments
+    :param store: the shared memory of transitions
+    :param view: what a policy sees
+    :param action_space: action space of the environment
+    :param radius: the event radius, in goal units
+    :param rng: random generator
+    :param replay_kwargs: ``hindsight``, ``shared`` and ``horizon`` of :class:`OptionReplay`
+    :param device: torch device
+    """
+
+    def __init__(
+        self,
+        option_class: type[OffPolicyAlgorithm],
+        option_kwargs: dict[str, Any],
+        store: TransitionStore,
+        view: ScaledView,
+        action_space: spaces.Box,
+        radius: float,
+        rng: np.random.Generator,
+        replay_kwargs: dict[str, Any],
+        device: th.device,
+    ) -> None:
+        self.option_class = option_class
+        self.option_kwargs = option_kwargs
+        self.store = store
+        self.view = view
+        self.action_space = action_space
+        self.radius = radius
+        self.rng = rng
+        self.replay_kwargs = replay_kwargs
+        self.device = device
+        dim = view.dim(store.column("observation", np.arange(0)).shape[1], store.column("goal", np.arange(0)).shape[1])
+        self.observation_space = spaces.Box(-np.inf, np.inf, (dim,), np.float32)
+
+    def unscale(self, scaled: np.ndarray) -> np.ndarray:
+        """Turn actions in [-1, 1], shape ``(n, action_dim)``, into the environment's own bounds."""
+        low, high = self.action_space.low.ravel(), self.action_space.high.ravel()
+        return low + 0.5 * (scaled + 1.0) * (high - low)
+
+    def make(self, id: str, target: str | None, termination: TerminationSet | None) -> Option:
+        """Make an option.
+
+        :param id: its name
+        :param target: id of what it leads to; None for the global option
+        :param termination: the set it ends in; None for the global option
+        :return: the option, gestating
+        """
+        everything = termination is None
+        rule = goal_rule(self.radius) if termination is None else termination_rule(termination, self.radius)
+        replay = OptionReplay(
+            self.store,
+            self.view,
+            rule,
+            self.observation_space,
+            self.action_space,
+            self.rng,
+            everything=everything,
+            device=self.device,
+            **self.replay_kwargs,
+        )
+        return Option(id, target, termination, self._learner(replay), self.radius)
+
+    def _learner(self, replay: OptionReplay) -> OffPolicyAlgorithm:
+        """Build the SB3 model without an environment, a logger's folder, or a reseeding of the global generators."""
+        learner = self.option_class("MlpPolicy", None, _init_setup_model=False, device=self.device, **self.option_kwargs)
+        learner.observation_space, learner.action_space, learner.n_envs = self.observation_space, self.action_space, 1
+        learner.replay_buffer = replay
+        with th.random.fork_rng(devices=[]):
+            # Initial weights come from our own generator, so that loading an agent draws nothing from torch's.
+            th.manual_seed(int(self.rng.integers(2**31)))
+            learner._setup_model()
+        learner.set_logger(Logger(folder=None, output_formats=[]))
+        learner.policy.set_training_mode(False)
+        return learner
+
+
+def copy_policy(source: Option, target: Option) -> None:
+    """Give one option the policy and value function of another.
+
+    :param source: the option copied from
+    :param target: the option copied to
+    """
+    with th.no_grad():
+        for theirs, ours in zip(
+            source.learner.policy.state_dict().values(), target.learner.policy.state_dict().values(), strict=True
+        ):
+            ours.copy_(theirs)

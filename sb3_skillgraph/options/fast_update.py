@@ -1,0 +1,377 @@
+"""
+The gradient step of SB3's DDPG and TD3 for plain networks, written out without autograd.
+
+The numbers are SB3's, the order of random draws too. What is saved: the gradients of the critic's weights that the
+actor's loss never uses, autograd's book-keeping, Adam's and Polyak's loops over parameters in Python, and, where the
+processor gains from it, MKL's matrix products in favour of oneDNN's.
+
+Nothing is kept beside the model: weights stay SB3's own parameters and the moments of Adam stay in
+``optimizer.state``, so ``state_dict``, ``load_state_dict``, ``set_parameters`` and copies mean what they always meant.
+"""
+
+import functools
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.policies import ContinuousCritic
+from stable_baselines3.common.preprocessing import is_image_space
+from stable_baselines3.common.torch_layers import FlattenExtractor
+from stable_baselines3.common.type_aliases import ReplayBufferSamples
+from stable_baselines3.td3.policies import Actor, TD3Policy
+from torch import nn
+
+# A call of oneDNN costs about 10 us more than one of MKL: only layers with this many weights win it back.
+ONEDNN_MIN_WEIGHTS = 32_768
+# MKL is up to four times slower at a product whose result is this narrow than at the transposed one.
+NARROW = 64
+
+
+@functools.cache
+def onednn_linear() -> Callable[..., th.Tensor] | None:
+    """
+    OneDNN's fused linear layer, which is a private operator of torch and so may be missing.
+
+    :return: the operator (input, weight, bias, "none" or "relu", [], "") -> output, or None where it does not work
+    """
+    if not th.backends.mkldnn.is_available():
+        return None
+    try:
+        operator = th.ops.mkldnn._linear_pointwise.default
+        operator(th.ones(2, 3), th.ones(4, 3), th.ones(4), "relu", [], "")
+    except (AttributeError, NotImplementedError, RuntimeError, TypeError):
+        return None
+    return operator
+
+
+class Layer:
+    """
+    One linear layer and its three matrix products.
+
+    :param linear: the torch module whose parameters are used where they are
+    """
+
+    def __init__(self, linear: nn.Linear) -> None:
+        self.weight = linear.weight
+        self.bias = linear.bias
+        use_onednn = linear.weight.device.type == "cpu" and linear.weight.numel() >= ONEDNN_MIN_WEIGHTS
+        self.product = onednn_linear() if use_onednn else None
+
+    def forward(self, inputs: th.Tensor, relu: bool) -> th.Tensor:
+        """
+        :param inputs: (batch, in)
+        :param relu: whether a ReLU follows
+        :return: (batch, out)
+        """
+        if self.product is not None:
+            return self.product(inputs, self.weight, self.bias, "relu" if relu else "none", [], "")
+        outputs = nn.functional.linear(inputs, self.weight, self.bias)
+        return outputs.relu_() if relu else outputs
+
+    def input_gradient(self, gradient: th.Tensor) -> th.Tensor:
+        """
+        :param gradient: (batch, out), of the loss by what this layer returned
+        :return: (batch, in)
+        """
+        if self.product is not None:
+            return self.product(gradient, self.weight.t(), None, "none", [], "")
+        return th.mm(gradient, self.weight)
+
+    def parameter_gradients(self, inputs: th.Tensor, gradient: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """
+        :param inputs: (batch, in), what the layer was given
+        :param gradient: (batch, out), of the loss by what this layer returned
+        :return: (out, in) for the weight and (out,) for the bias
+        """
+        if self.product is not None:
+            weight = self.product(gradient.t(), inputs.t(), None, "none", [], "")
+        elif inputs.shape[1] <= NARROW < gradient.shape[1]:
+            # The fused optimiser walks over memory, so the layout has to be that of the weight.
+            weight = th.mm(inputs.t(), gradient).t().contiguous()
+        else:
+            weight = th.mm(gradient.t(), inputs)
+        return weight, gradient.sum(0)
+
+
+class Network:
+    """
+    Linear layers with a ReLU between one and the next, and nothing after the last.
+
+    :param linears: the torch modules, first to last
+    """
+
+    def __init__(self, linears: Iterable[nn.Linear]) -> None:
+        self.layers = [Layer(linear) for linear in linears]
+
+    def parameters(self) -> list[th.Tensor]:
+        """:return: weight and bias of every layer, in torch's order"""
+        return [parameter for layer in self.layers for parameter in (layer.weight, layer.bias)]
+
+    def forward(self, inputs: th.Tensor) -> list[th.Tensor]:
+        """
+        :param inputs: (batch, in)
+        :return: what every layer was given, and last what the network returns: (batch, out)
+        """
+        values = [inputs]
+        for layer in self.layers[:-1]:
+            values.append(layer.forward(values[-1], relu=True))
+        values.append(self.layers[-1].forward(values[-1], relu=False))
+        return values
+
+    def parameter_gradients(self, values: list[th.Tensor], gradient: th.Tensor) -> list[th.Tensor]:
+        """
+        :param values: what ``forward`` returned
+        :param gradient: (batch, out), of the loss by the network's result
+        :return: one for each of ``parameters()``
+        """
+        gradients: list[th.Tensor] = []
+        for i in range(len(self.layers) - 1, -1, -1):
+            gradients[:0] = self.layers[i].parameter_gradients(values[i], gradient)
+            if i > 0:
+                gradient = self._through_relu(i, values, gradient)
+        return gradients
+
+    def input_gradient(self, values: list[th.Tensor], gradient: th.Tensor, start: int) -> th.Tensor:
+        """
+        :param values: what ``forward`` returned
+        :param gradient: (batch, out), of the loss by the network's result
+        :param start: the first column of the input that is asked for
+        :return: (batch, in - start)
+        """
+        for i in range(len(self.layers) - 1, 0, -1):
+            gradient = self._through_relu(i, values, gradient)
+        return th.mm(self.layers[0].weight[:, start:].t(), gradient.t()).t()
+
+    def _through_relu(self, i: int, values: list[th.Tensor], gradient: th.Tensor) -> th.Tensor:
+        gradient = self.layers[i].input_gradient(gradient)
+        return th.ops.aten.threshold_backward.grad_input(gradient, values[i], 0, grad_input=gradient)
+
+
+class Adam:
+    """
+    One fused step of a ``th.optim.Adam`` on gradients that are given, kept in that optimiser's own state.
+
+    :param optimizer: an Adam with one group of parameters, ``amsgrad`` off
+    """
+
+    def __init__(self, optimizer: th.optim.Optimizer) -> None:
+        self.optimizer = optimizer
+        self._attach()
+
+    @property
+    def parameters(self) -> list[th.Tensor]:
+        """:return: what the optimiser learns"""
+        return self.optimizer.param_groups[0]["params"]
+
+    def follow(self) -> None:
+        """Notice when ``load_state_dict`` has put another state in place of the one in use."""
+        state = self.optimizer.state
+        if state is not self._state or self._counts[0] is not state.get(self.parameters[0], {}).get("step"):
+            self._attach()
+
+    def step(self, gradients: list[th.Tensor]) -> None:
+        """:param gradients: one for each parameter, of its shape and contiguous"""
+        group = self.optimizer.param_groups[0]
+        self._all_counts.add_(1)
+        th._fused_adam_(
+            group["params"],
+            gradients,
+            self._averages,
+            self._squares,
+            [],
+            self._counts,
+            lr=group["lr"],
+            beta1=group["betas"][0],
+            beta2=group["betas"][1],
+            weight_decay=group["weight_decay"],
+            eps=group["eps"],
+            amsgrad=False,
+            maximize=group["maximize"],
+        )
+
+    def _attach(self) -> None:
+        self._state = self.optimizer.state
+        states = [self._state[parameter] for parameter in self.parameters]
+        for parameter, state in zip(self.parameters, states, strict=True):
+            if not state:
+                state["step"] = th.zeros(())
+                state["exp_avg"] = th.zeros_like(parameter)
+                state["exp_avg_sq"] = th.zeros_like(parameter)
+        # The counts of all parameters lie side by side, and where the parameters are, for one addition to raise them.
+        self._all_counts = th.stack([state["step"].to(self.parameters[0].device) for state in states])
+        self._counts = [self._all_counts[i] for i in range(len(states))]
+        for state, count in zip(states, self._counts, strict=True):
+            state["step"] = count
+        self._averages = [state["exp_avg"] for state in states]
+        self._squares = [state["exp_avg_sq"] for state in states]
+
+
+class FastUpdate:
+    """
+    SB3's ``TD3.train`` for one policy, a gradient step at a time.
+
+    :param policy: one for which ``why_not`` has no objection
+    """
+
+    def __init__(self, policy: TD3Policy) -> None:
+        self.policy = policy
+        self.actor = Network(linears(policy.actor.mu))
+        self.actor_target = Network(linears(policy.actor_target.mu))
+        self.critics = [Network(linears(q)) for q in policy.critic.q_networks]
+        self.critic_targets = [Network(linears(q)) for q in policy.critic_target.q_networks]
+        self.actor_adam = Adam(policy.actor.optimizer)
+        self.critic_adam = Adam(policy.critic.optimizer)
+        self._learned = self.critic_adam.parameters + self.actor_adam.parameters
+        critic_targets = [parameter for critic in self.critic_targets for parameter in critic.parameters()]
+        self._targets = critic_targets + self.actor_target.parameters()
+
+    def __reduce__(self) -> tuple[type["FastUpdate"], tuple[TD3Policy]]:
+        # Copies and pickles look at their own policy afresh: nothing here is more than a view of it.
+        return FastUpdate, (self.policy,)
+
+    def follow(self) -> None:
+        """Use what was loaded into the optimisers since the last gradient step."""
+        self.actor_adam.follow()
+        self.critic_adam.follow()
+
+    def update_critics(
+        self, data: ReplayBufferSamples, gamma: float, noise_std: float, noise_clip: float
+    ) -> tuple[th.Tensor, th.Tensor]:
+        """
+        One gradient step of all critics towards the same target.
+
+        :param data: a minibatch of ``batch`` transitions
+        :param gamma: discount where the minibatch has none of its own
+        :param noise_std: standard deviation of the noise on the target's actions (TD3's smoothing)
+        :param noise_clip: largest size of that noise
+        :return: the critics' loss, (), and what they were given, (batch, observation + action)
+        """
+        inputs = th.cat([_flat(data.observations), data.actions], dim=1)
+        target = self._target(data, gamma, noise_std, noise_clip)
+        loss, gradients = th.zeros((), device=inputs.device), []
+        for critic in self.critics:
+            values = critic.forward(inputs)
+            error = values[-1] - target
+            loss += th.dot(error[:, 0], error[:, 0]) / len(error)
+            gradients += critic.parameter_gradients(values, error.mul_(2 / len(error)))
+        self.critic_adam.step(gradients)
+        return loss, inputs
+
+    def update_actor(self, inputs: th.Tensor) -> th.Tensor:
+        """
+        One gradient step of the actor up the first critic.
+
+        :param inputs: (batch, observation + action); the actions are overwritten by the actor's
+        :return: the actor's loss, ()
+        """
+        critic = self.critics[0]
+        start = self.actor.layers[0].weight.shape[1]
+        values = self.actor.forward(inputs[:, :start])
+        actions = values[-1].tanh_()
+        inputs[:, start:] = actions
+        critic_values = critic.forward(inputs)
+        ascent = th.full_like(critic_values[-1], -1 / len(inputs))
+        gradient = th.ops.aten.tanh_backward.default(critic.input_gradient(critic_values, ascent, start), actions)
+        self.actor_adam.step(self.actor.parameter_gradients(values, gradient))
+        return -critic_values[-1].mean()
+
+    def update_targets(self, tau: float) -> None:
+        """
+        Move all target networks towards the learned ones.
+
+        :param tau: SB3's soft update coefficient, 1 copies
+        """
+        th._foreach_lerp_(self._targets, self._learned, tau)
+
+    def _target(self, data: ReplayBufferSamples, gamma: float, noise_std: float, noise_clip: float) -> th.Tensor:
+        observations = _flat(data.next_observations)
+        # Drawn even where it is clipped to nothing (DDPG), so that the global generator ends where SB3 leaves it.
+        noise = th.empty_like(data.actions).normal_(0, noise_std)
+        actions = self.actor_target.forward(observations)[-1].tanh_()
+        if noise_clip > 0:
+            actions = actions.add_(noise.clamp_(-noise_clip, noise_clip)).clamp_(-1, 1)
+        inputs = th.cat([observations, actions], dim=1)
+        next_values = self.critic_targets[0].forward(inputs)[-1]
+        for critic in self.critic_targets[1:]:
+            next_values = th.minimum(next_values, critic.forward(inputs)[-1])
+        discounts = gamma if data.discounts is None else data.discounts
+        return (data.rewards + (1 - data.dones) * discounts * next_values).float()
+
+
+def why_not(policy: Any) -> str | None:
+    """
+    Say why ``FastUpdate`` cannot stand in for SB3's own update.
+
+    :param policy: an SB3 policy
+    :return: the reason, or None when it can
+    """
+    if not isinstance(policy, TD3Policy):
+        return f"the policy is a {type(policy).__name__}, not a TD3Policy"
+    if not is_vector_space(policy.observation_space):
+        return "the observations are not plain vectors"
+    models = (policy.actor, policy.actor_target, policy.critic, policy.critic_target)
+    for model, known in zip(models, (Actor, Actor, ContinuousCritic, ContinuousCritic), strict=True):
+        if type(model) is not known:
+            return f"a network is a {type(model).__name__}, not a {known.__name__}"
+        if type(model.features_extractor) is not FlattenExtractor:
+            return f"the features come from a {type(model.features_extractor).__name__}"
+    actors = (policy.actor.mu, policy.actor_target.mu)
+    critics = (*policy.critic.q_networks, *policy.critic_target.q_networks)
+    if not (all(is_plain(net, squashed=True) for net in actors) and all(is_plain(net) for net in critics)):
+        return "a network is not made of Linear and ReLU layers"
+    return _why_not_adam(policy.actor) or _why_not_adam(policy.critic)
+
+
+def is_vector_space(space: spaces.Space) -> bool:
+    """
+    :param space: an observation space
+    :return: whether SB3 hands observations of it to a network as they are, flattened
+    """
+    return isinstance(space, spaces.Box) and len(space.shape) > 0 and not is_image_space(space)
+
+
+def is_plain(network: nn.Module, squashed: bool = False) -> bool:
+    """
+    :param network: any module
+    :param squashed: whether a Tanh must follow the last layer
+    :return: whether it is float32 Linear layers with biases and a ReLU between one and the next
+    """
+    if type(network) is not nn.Sequential:
+        return False
+    modules = list(network)
+    if squashed and (not modules or type(modules.pop()) is not nn.Tanh):
+        return False
+    linears, relus = modules[::2], modules[1::2]
+    return (
+        len(modules) % 2 == 1
+        and all(type(module) is nn.ReLU for module in relus)
+        and all(type(module) is nn.Linear and module.bias is not None for module in linears)
+        and all(parameter.dtype == th.float32 for parameter in network.parameters())
+    )
+
+
+def _why_not_adam(model: nn.Module) -> str | None:
+    optimizer = model.optimizer
+    if type(optimizer) is not th.optim.Adam:
+        return f"the optimiser is {type(optimizer).__name__}, not Adam"
+    own = list(model.parameters())
+    groups = optimizer.param_groups
+    if len(groups) != 1 or [id(p) for p in groups[0]["params"]] != [id(p) for p in own]:
+        return "the optimiser does not hold the network's parameters in one group"
+    for option in ("amsgrad", "capturable", "differentiable", "decoupled_weight_decay"):
+        if groups[0].get(option, False):
+            return f"Adam's {option} is on"
+    return None
+
+
+def linears(network: nn.Module) -> list[nn.Linear]:
+    """
+    :param network: one that ``is_plain``
+    :return: its linear layers, first to last
+    """
+    return [module for module in network.children() if isinstance(module, nn.Linear)]
+
+
+def _flat(observations: th.Tensor) -> th.Tensor:
+    return observations.flatten(1).float()

@@ -1,0 +1,217 @@
+"""Initiation sets: where an option can start, learned from where it succeeded and failed (sections 2.1, 2.2).
+
+scikit-learn fits the support vector machines, NumPy evaluates them: a membership question costs microseconds, and the
+same question can be put to many sets in one batch.
+"""
+
+from collections import deque
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from sklearn.svm import SVC, OneClassSVM
+
+# Successes cover an option's region densely, so few trajectories with few points each describe it well.
+N_SUCCESSES, POINTS_PER_SUCCESS, N_FAILURES = 40, 12, 30
+
+
+class Boundary(NamedTuple):
+    """The decision function of a fitted RBF support vector machine, as plain arrays.
+
+    ``support``: shape ``(m, goal_dim)``; ``weights``: shape ``(m,)``.
+    """
+
+    support: np.ndarray
+    weights: np.ndarray
+    intercept: float
+    gamma: float
+
+    def inside(self, points: np.ndarray) -> np.ndarray:
+        """Tell which points lie on the positive side.
+
+        :param points: shape ``(n, goal_dim)``
+        :return: bool array of shape ``(n,)``
+        """
+        squared = (
+            np.einsum("ij,ij->i", points, points)[:, None]
+            - 2.0 * points @ self.support.T
+            + np.einsum("ij,ij->i", self.support, self.support)
+        )
+        return np.exp(-self.gamma * squared) @ self.weights + self.intercept > 0.0
+
+
+class InitiationSet:
+    """Where an option can start, twice: optimistic and pessimistic.
+
+    *Optimistic*: the region of all successes, less what the failures took away; an option may be *started* there.
+    *Pessimistic*: the core of that region; what another option may *aim at*, so that reaching it is sure to let this
+    option start. A success that passes where an earlier attempt failed outvotes that failure, so the set follows the
+    policy as it improves.
+
+    :param radius: the resolution of the set, in goal units: two states nearer than half of it count as the same place
+    """
+
+    def __init__(self, radius: float) -> None:
+        self.radius = radius
+        self.successes: deque[np.ndarray] = deque(maxlen=N_SUCCESSES)
+        self.failures: deque[np.ndarray] = deque(maxlen=N_FAILURES)
+        self.optimistic_boundaries: list[Boundary] = []
+        self.pessimistic_boundaries: list[Boundary] = []
+        self.core: np.ndarray | None = None
+        self._n_news = 0
+
+    @property
+    def is_fitted(self) -> bool:
+        """Whether there is a set at all; an option without one starts nowhere but in its own gestation."""
+        return bool(self.optimistic_boundaries)
+
+    def add_success(self, path: np.ndarray) -> None:
+        """Remember the way of a successful run.
+
+        :param path: the states from its start to before its end, shape ``(n, goal_dim)``, ``n >= 1``
+        """
+        chosen = np.unique(np.linspace(0, len(path) - 1, POINTS_PER_SUCCESS).astype(int))
+        self.successes.append(np.asarray(path, dtype=np.float64)[chosen])
+        self._n_news += 1
+
+    def add_failure(self, start: np.ndarray) -> None:
+        """Remember where a failed run began.
+
+        :param start: shape ``(goal_dim,)``
+        """
+        self.failures.append(np.asarray(start, dtype=np.float64))
+        self._n_news += 1
+
+    def refit(self, force: bool = False) -> bool:
+        """Fit the set to its examples, if enough of them are new.
+
+        :param force: fit whatever has changed
+        :return: whether the set was fitted
+        """
+        known = len(self.successes)
+        if not known or not (force or self._n_news * 5 >= known):
+            return False
+        self._n_news = 0
+        positives = np.concatenate(self.successes)
+        negatives = self._standing_failures()
+        # A floor under the kernel's width: a handful of points in one spot still describe a place, not a point.
+        gamma = 1.0 / (positives.shape[1] * max(float(positives.var()), (0.5 * self.radius) ** 2))
+        self.optimistic_boundaries = [_one_class(positives, 0.01, gamma)]
+        accepted = positives
+        if len(negatives):
+            classes = np.repeat([1, 0], [len(positives), len(negatives)])
+            points = np.concatenate([positives, negatives])
+            machine = SVC(kernel="rbf", gamma=gamma, class_weight="balanced").fit(points, classes)
+            split = Boundary(machine.support_vectors_, machine.dual_coef_[0], float(machine.intercept_[0]), gamma)
+            self.optimistic_boundaries.append(split)
+            accepted = positives[split.inside(positives)]
+            accepted = accepted if len(accepted) else positives
+        self.pessimistic_boundaries = [_one_class(accepted, 0.1, gamma)]
+        self.core = self._deepest(accepted)
+        return True
+
+    def _standing_failures(self) -> np.ndarray:
+        """Return the failed starts that later successes have not outvoted, shape ``(n, goal_dim)``."""
+        if not self.failures:
+            return np.zeros((0, self.successes[0].shape[1]))
+        failures = np.stack(self.failures)
+        near = (0.5 * self.radius) ** 2
+        against = (_squared_distances(failures, failures) <= near).sum(axis=1)
+        passed = [(_squared_distances(failures, path) <= near).any(axis=1) for path in self.successes]
+        return failures[against > np.sum(passed, axis=0)]
+
+    def _deepest(self, points: np.ndarray) -> np.ndarray:
+        """Return the example furthest inside the pessimistic set: the surest thing to aim at."""
+        boundary = self.pessimistic_boundaries[0]
+        squared = _squared_distances(points, boundary.support)
+        return points[int((np.exp(-boundary.gamma * squared) @ boundary.weights).argmax())]
+
+    def optimistic(self, points: np.ndarray) -> np.ndarray:
+        """Tell from which points the option may be started.
+
+        :param points: shape ``(n, goal_dim)``
+        :return: bool array of shape ``(n,)``, all False before the first fit
+        """
+        return _inside_all(self.optimistic_boundaries, points)
+
+    def pessimistic(self, points: np.ndarray) -> np.ndarray:
+        """Tell which points another option may aim at.
+
+        :param points: shape ``(n, goal_dim)``
+        :return: bool array of shape ``(n,)``, all False before the first fit
+        """
+        return _inside_all(self.pessimistic_boundaries, points)
+
+    def get_state(self) -> dict[str, Any]:
+        """Return examples and boundaries as plain data."""
+        return {
+            "successes": list(self.successes),
+            "failures": list(self.failures),
+            "optimistic": [boundary._asdict() for boundary in self.optimistic_boundaries],
+            "pessimistic": [boundary._asdict() for boundary in self.pessimistic_boundaries],
+            "core": self.core,
+            "n_news": self._n_news,
+        }
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Restore what :meth:`get_state` returned."""
+        self.successes = deque(state["successes"], maxlen=N_SUCCESSES)
+        self.failures = deque(state["failures"], maxlen=N_FAILURES)
+        self.optimistic_boundaries = [Boundary(**boundary) for boundary in state["optimistic"]]
+        self.pessimistic_boundaries = [Boundary(**boundary) for boundary in state["pessimistic"]]
+        self.core = state["core"]
+        self._n_news = state["n_news"]
+
+
+class InitiationBank:
+    """The optimistic sets of many options, asked together: one batched query instead of one per option.
+
+    :param sets: fitted initiation sets
+    """
+
+    def __init__(self, sets: Sequence[InitiationSet]) -> None:
+        boundaries = [boundary for initiation in sets for boundary in initiation.optimistic_boundaries]
+        self.n_sets = len(sets)
+        if not boundaries:
+            return
+        self._support = np.concatenate([b.support for b in boundaries])
+        self._norms = np.einsum("ij,ij->i", self._support, self._support)
+        self._weights = np.concatenate([b.weights for b in boundaries])
+        self._gamma = np.concatenate([np.full(len(b.support), b.gamma) for b in boundaries])
+        self._intercepts = np.array([b.intercept for b in boundaries])
+        self._starts = np.cumsum([0] + [len(b.support) for b in boundaries[:-1]])
+        self._set_starts = np.cumsum([0] + [len(s.optimistic_boundaries) for s in sets[:-1]])
+
+    def contains(self, points: np.ndarray) -> np.ndarray:
+        """Tell for every point which sets contain it.
+
+        :param points: shape ``(n, goal_dim)``
+        :return: bool array of shape ``(n, n_sets)``
+        """
+        if self.n_sets == 0:
+            return np.zeros((len(points), 0), dtype=bool)
+        points = np.asarray(points, dtype=np.float64)
+        squared = np.einsum("ij,ij->i", points, points)[:, None] - 2.0 * points @ self._support.T + self._norms
+        squared *= -self._gamma
+        np.exp(squared, out=squared)
+        squared *= self._weights
+        decisions = np.add.reduceat(squared, self._starts, axis=1) + self._intercepts
+        return np.logical_and.reduceat(decisions > 0.0, self._set_starts, axis=1)
+
+
+def _one_class(points: np.ndarray, nu: float, gamma: float) -> Boundary:
+    machine = OneClassSVM(kernel="rbf", nu=nu, gamma=gamma).fit(points)
+    # A hair of slack: libsvm leaves its own margin vectors a rounding error outside.
+    return Boundary(machine.support_vectors_, machine.dual_coef_[0], float(machine.intercept_[0]) + 1e-3, gamma)
+
+
+def _inside_all(boundaries: list[Boundary], points: np.ndarray) -> np.ndarray:
+    points = np.asarray(points, dtype=np.float64)
+    inside = np.full(len(points), bool(boundaries))
+    for boundary in boundaries:
+        inside &= boundary.inside(points)
+    return inside
+
+
+def _squared_distances(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return ((a[:, None, :] - b[None, :, :]) ** 2).sum(axis=2)

@@ -1,0 +1,138 @@
+"""What learns an option's policy: SB3's DDPG and TD3 with one learning rate each for actor and critic, and fast."""
+
+import functools
+import warnings
+from typing import Any
+
+import torch as th
+from stable_baselines3.common.type_aliases import GymEnv
+from stable_baselines3.ddpg.ddpg import DDPG
+from stable_baselines3.td3.policies import TD3Policy
+from stable_baselines3.td3.td3 import TD3
+
+from sb3_skillgraph.options.fast_update import FastUpdate, why_not
+
+
+class OptionLearner(TD3):
+    """
+    Two learning rates and a fast ``train`` for SB3's DDPG and TD3, mixed in before either.
+
+    :param policy: the policy model to use (MlpPolicy, CnnPolicy, ...)
+    :param env: the environment to learn from (if registered in Gym, can be str; None builds no environment)
+    :param actor_learning_rate: Adam's learning rate for the actor
+    :param critic_learning_rate: Adam's learning rate for the critics
+    :param kwargs: all other arguments of the SB3 class except ``learning_rate``, which these two replace
+    """
+
+    def __init__(
+        self,
+        policy: str | type[TD3Policy],
+        env: GymEnv | str | None,
+        *,
+        actor_learning_rate: float = 1e-4,
+        critic_learning_rate: float = 1e-3,
+        **kwargs: Any,
+    ) -> None:
+        self.actor_learning_rate = actor_learning_rate
+        self.critic_learning_rate = critic_learning_rate
+        self._fast_update: FastUpdate | None = None
+        super().__init__(policy, env, learning_rate=critic_learning_rate, **kwargs)  # type: ignore[arg-type]
+
+    def _setup_model(self) -> None:
+        super()._setup_model()
+        self._set_learning_rates()
+
+    def _set_learning_rates(self) -> None:
+        for optimizer, learning_rate in (
+            (self.actor.optimizer, self.actor_learning_rate),
+            (self.critic.optimizer, self.critic_learning_rate),
+        ):
+            for group in optimizer.param_groups:
+                group["lr"] = learning_rate
+
+    def _update_learning_rate(self, optimizers: list[th.optim.Optimizer] | th.optim.Optimizer) -> None:
+        self.logger.record("train/learning_rate", self.critic_learning_rate)
+        self._set_learning_rates()
+
+    def train(self, gradient_steps: int, batch_size: int = 100) -> None:
+        """
+        Do gradient steps on minibatches of the replay buffer, as SB3 does them.
+
+        :param gradient_steps: number of updates
+        :param batch_size: transitions in a minibatch
+        """
+        fast = self._find_fast_update()
+        if fast is None:
+            super().train(gradient_steps, batch_size)
+            return
+        if not self.policy.training:
+            self.policy.set_training_mode(True)
+        self._update_learning_rate([self.actor.optimizer, self.critic.optimizer])
+        actor_losses, critic_losses = self._gradient_steps(fast, gradient_steps, batch_size)
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        for name, losses in (("train/actor_loss", actor_losses), ("train/critic_loss", critic_losses)):
+            if losses:
+                self.logger.record(name, sum(loss.item() for loss in losses) / len(losses))
+
+    def _gradient_steps(
+        self, fast: FastUpdate, gradient_steps: int, batch_size: int
+    ) -> tuple[list[th.Tensor], list[th.Tensor]]:
+        assert self.replay_buffer is not None
+        actor_losses, critic_losses = [], []
+        for _ in range(gradient_steps):
+            self._n_updates += 1
+            data = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
+            with th.inference_mode():
+                loss, inputs = fast.update_critics(data, self.gamma, self.target_policy_noise, self.target_noise_clip)
+                critic_losses.append(loss)
+                if self._n_updates % self.policy_delay == 0:
+                    actor_losses.append(fast.update_actor(inputs))
+                    fast.update_targets(self.tau)
+        return actor_losses, critic_losses
+
+    def _find_fast_update(self) -> FastUpdate | None:
+        if self._fast_update is not None and self._fast_update.policy is self.policy:
+            self._fast_update.follow()
+            return self._fast_update
+        reason = why_not(self.policy)
+        if reason is not None:
+            _warn_once(reason)
+            return None
+        self._fast_update = FastUpdate(self.policy)
+        return self._fast_update
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_fast_update"]
+
+
+class OptionDDPG(OptionLearner, DDPG):
+    """
+    Deep Deterministic Policy Gradient for one option, with the paper's two learning rates (Table 1).
+
+    The same numbers as ``stable_baselines3.DDPG``, sooner where the networks are plain (``benchmarks/update.py``).
+
+    :param policy: the policy model to use (MlpPolicy, CnnPolicy, ...)
+    :param env: the environment to learn from (if registered in Gym, can be str; None builds no environment)
+    :param actor_learning_rate: Adam's learning rate for the actor
+    :param critic_learning_rate: Adam's learning rate for the critics
+    :param kwargs: all other arguments of ``stable_baselines3.DDPG`` except ``learning_rate``
+    """
+
+
+class OptionTD3(OptionLearner, TD3):
+    """
+    Twin Delayed DDPG for one option, with one learning rate for the actor and one for the critics.
+
+    The same numbers as ``stable_baselines3.TD3``, sooner where the networks are plain (``benchmarks/update.py``).
+
+    :param policy: the policy model to use (MlpPolicy, CnnPolicy, ...)
+    :param env: the environment to learn from (if registered in Gym, can be str; None builds no environment)
+    :param actor_learning_rate: Adam's learning rate for the actor
+    :param critic_learning_rate: Adam's learning rate for the critics
+    :param kwargs: all other arguments of ``stable_baselines3.TD3`` except ``learning_rate``
+    """
+
+
+@functools.cache
+def _warn_once(reason: str) -> None:
+    warnings.warn(f"Options train with SB3's own, slower update: {reason}.", stacklevel=4)

@@ -1,0 +1,77 @@
+"""Acting without torch: one observation through a small network costs torch more in calls than in arithmetic."""
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.torch_layers import FlattenExtractor
+from stable_baselines3.sac.policies import Actor as SACActor
+from stable_baselines3.td3.policies import Actor
+from torch import nn
+
+from sb3_skillgraph.options.fast_update import is_plain, is_vector_space, linears
+
+
+class NumpyActor:
+    """
+    The deterministic actor of an SB3 policy, evaluated by NumPy on the memory of torch's own weights.
+
+    It follows training with no copy. Actors it cannot read (other layers, other features, weights on a GPU) are
+    evaluated by torch instead, so that it stands in for any actor of TD3, DDPG or SAC.
+
+    :param actor: ``model.policy.actor``
+    """
+
+    def __init__(self, actor: BasePolicy) -> None:
+        self.actor = actor
+        self._parameters = list(actor.parameters())
+        self._view()
+
+    def act(self, observations: np.ndarray) -> np.ndarray:
+        """
+        :param observations: (n, d) float32, or (n, *shape of the observation space)
+        :return: (n, a) float32 actions in [-1, 1], as the network gives them
+        """
+        if [parameter.data_ptr() for parameter in self._parameters] != self._addresses:
+            self._view()
+        if not self._layers:
+            return self._act_by_torch(observations)
+        values = observations.reshape(len(observations), -1).astype(np.float32, copy=False)
+        for weight, bias in self._layers[:-1]:
+            values = np.dot(values, weight)
+            values += bias
+            np.maximum(values, 0, out=values)
+        weight, bias = self._layers[-1]
+        values = np.dot(values, weight)
+        values += bias
+        return np.tanh(values, out=values)
+
+    def __reduce__(self) -> tuple[type["NumpyActor"], tuple[BasePolicy]]:
+        # An array's copy would part from the weights: a copy or a pickle views those of its own actor.
+        return NumpyActor, (self.actor,)
+
+    def _view(self) -> None:
+        # Moving a module or giving it other data leaves the old memory behind; the addresses tell.
+        self._addresses = [parameter.data_ptr() for parameter in self._parameters]
+        self._layers = [
+            (linear.weight.detach().numpy().T, linear.bias.detach().numpy()) for linear in _plain_linears(self.actor)
+        ]
+
+    def _act_by_torch(self, observations: np.ndarray) -> np.ndarray:
+        with th.no_grad():
+            actions = self.actor._predict(th.as_tensor(observations, device=self.actor.device), deterministic=True)
+        return actions.cpu().numpy()
+
+
+def _plain_linears(actor: BasePolicy) -> list[nn.Linear]:
+    if type(actor.features_extractor) is not FlattenExtractor or not is_vector_space(actor.observation_space):
+        return []
+    if actor.device.type != "cpu":
+        return []
+    if type(actor) is SACActor:
+        # SAC's deterministic action is the Tanh of its mean, a layer of its own on top of the shared ones.
+        network = nn.Sequential(*actor.latent_pi, actor.mu, nn.Tanh())
+    elif type(actor) is Actor:
+        network = actor.mu
+    else:
+        return []
+    return linears(network) if is_plain(network, squashed=True) else []

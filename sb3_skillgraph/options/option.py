@@ -1,0 +1,181 @@
+"""An option: initiation set, policy, termination set, effect set and the record of its runs (section 2.1)."""
+
+from collections import deque
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+
+from sb3_skillgraph.events import TerminationSet
+from sb3_skillgraph.options.initiation import InitiationSet
+from sb3_skillgraph.options.numpy_actor import NumpyActor
+from sb3_skillgraph.replay import OptionReplay, OptionRule
+
+RECORD_LENGTH = 20  # runs that count: an option's policy changes, and old runs speak of an old policy
+EFFECTS_LENGTH = 50
+
+
+class Option:
+    """A skill: where it may start, how it acts, where it ends.
+
+    It names its target by id, never by object, so that it can be saved as plain data: ``target`` is a salient event,
+    or, further down a skill chain, the option whose initiation set it leads to.
+
+    An option *gestates* until it has succeeded often enough; then it is *mature*: it has an initiation set and belongs
+    in the skill graph.
+
+    :param id: its name, and that of its vertex in the skill graph
+    :param target: id of the event or option it leads to; None for the global option
+    :param termination: the set it ends in; None for the global option, which is given a goal each time
+    :param learner: the SB3 model that holds its policy
+    :param radius: the event radius, in goal units
+    """
+
+    def __init__(
+        self,
+        id: str,
+        target: str | None,
+        termination: TerminationSet | None,
+        learner: OffPolicyAlgorithm,
+        radius: float,
+    ) -> None:
+        self.id = id
+        self.target = target
+        self.termination = termination
+        self.learner = learner
+        self.radius = radius
+        self.initiation = InitiationSet(radius)
+        self.mature = False
+        self.n_successes = 0
+        self.n_runs = 0
+        self.record: deque[bool] = deque(maxlen=RECORD_LENGTH)
+        self.durations: deque[int] = deque(maxlen=RECORD_LENGTH)
+        self.effects: deque[np.ndarray] = deque(maxlen=EFFECTS_LENGTH)
+        self._actor: NumpyActor | None = None
+
+    @property
+    def replay(self) -> OptionReplay:
+        """The option's view of the shared store."""
+        replay = self.learner.replay_buffer
+        assert isinstance(replay, OptionReplay)
+        return replay
+
+    @property
+    def actor(self) -> NumpyActor:
+        """The policy, for roll-outs."""
+        if self._actor is None:
+            self._actor = NumpyActor(self.learner.policy.actor)
+        return self._actor
+
+    def contains(self, points: np.ndarray) -> np.ndarray:
+        """Tell which points an option may aim at that leads here: this option's pessimistic initiation set.
+
+        :param points: shape ``(n, goal_dim)``
+        :return: bool array of shape ``(n,)``
+        """
+        return self.initiation.pessimistic(points)
+
+    def terminates(self, points: np.ndarray) -> np.ndarray:
+        """Tell at which points the option has succeeded, bool array of shape ``(n,)``."""
+        assert self.termination is not None, "The global option ends where it is told to."
+        return self.termination.contains(points)
+
+    @property
+    def subgoal(self) -> np.ndarray:
+        """The point of its termination set the option aims at, shape ``(goal_dim,)``."""
+        if isinstance(self.termination, Option):
+            core = self.termination.initiation.core
+            assert core is not None, f"Option {self.id!r} leads to {self.target!r}, which is not mature."
+            return core
+        center = getattr(self.termination, "center", None)
+        assert center is not None, f"The target of option {self.id!r} has no centre to aim at."
+        return np.asarray(center)
+
+    def success_rate(self, prior: float = 1.0) -> float:
+        """Return the share of recent runs that succeeded.
+
+        :param prior: pseudo-counts of a success and of a failure; 0 gives the plain share (0 with no runs)
+        :return: between 0 and 1
+        """
+        n = len(self.record) + 2 * prior
+        return (sum(self.record) + prior) / n if n else 0.0
+
+    def succeeded(self, path: np.ndarray, end: np.ndarray, *, own: bool = True) -> None:
+        """Learn from a run that reached the termination set.
+
+        :param path: states from the start of the run to before its end, shape ``(n, goal_dim)``
+        :param end: the state it ended in, shape ``(goal_dim,)``
+        :param own: False if another option's run happened to lead here: it shows the way, but is no run of ours
+        """
+        self.n_successes += 1
+        self.initiation.add_success(path)
+        if own:
+            self.n_runs += 1
+            self.record.append(True)
+            self.durations.append(len(path))
+            self.effects.append(np.asarray(end, dtype=np.float64))
+
+    def failed(self, start: np.ndarray) -> None:
+        """Learn from a run that timed out.
+
+        :param start: the state it began in, shape ``(goal_dim,)``
+        """
+        self.n_runs += 1
+        self.record.append(False)
+        self.initiation.add_failure(start)
+
+    def get_state(self) -> dict[str, Any]:
+        """Return all but the learner's networks as plain data."""
+        return {
+            "id": self.id,
+            "target": self.target,
+            "mature": self.mature,
+            "n_successes": self.n_successes,
+            "n_runs": self.n_runs,
+            "record": list(self.record),
+            "durations": list(self.durations),
+            "effects": list(self.effects),
+            "initiation": self.initiation.get_state(),
+            "n_updates": self.learner._n_updates,
+        }
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Restore what :meth:`get_state` returned."""
+        self.mature = state["mature"]
+        self.n_successes, self.n_runs = state["n_successes"], state["n_runs"]
+        self.record = deque(state["record"], maxlen=RECORD_LENGTH)
+        self.durations = deque(state["durations"], maxlen=RECORD_LENGTH)
+        self.effects = deque(state["effects"], maxlen=EFFECTS_LENGTH)
+        self.initiation.set_state(state["initiation"])
+        self.learner._n_updates = state["n_updates"]
+
+
+def goal_rule(radius: float) -> OptionRule:
+    """Return the rule of an option that is given its goal: it ends within ``radius`` of it.
+
+    :param radius: distance in goal units
+    :return: the rule of the global option, and of every transition relabelled in hindsight
+    """
+
+    def reached(achieved_goal: np.ndarray, goal: np.ndarray, imagined: np.ndarray) -> np.ndarray:
+        offset = achieved_goal - goal
+        return np.einsum("ij,ij->i", offset, offset) <= radius**2
+
+    return OptionRule(reached)
+
+
+def termination_rule(termination: TerminationSet, radius: float) -> OptionRule:
+    """Return the rule of an option with a termination set of its own.
+
+    :param termination: where the option ends
+    :param radius: radius of a goal put in by hindsight, in goal units
+    :return: the rule
+    """
+    near_goal = goal_rule(radius)
+
+    def reached(achieved_goal: np.ndarray, goal: np.ndarray, imagined: np.ndarray) -> np.ndarray:
+        hit = near_goal.reached(achieved_goal, goal, imagined)
+        hit[~imagined] = termination.contains(achieved_goal[~imagined])
+        return hit
+
+    return OptionRule(reached)

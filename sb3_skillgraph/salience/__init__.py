@@ -1,0 +1,1 @@
+"""Salient events: how they are proposed, filtered and chosen as targets."""

@@ -1,0 +1,207 @@
+"""Trees of plain data as one zip: JSON beside ``.npy`` members, nothing that could run code on loading.
+
+A tree is made of None, bool, int, float, str, list, tuple, dict, NumPy arrays and torch tensors. Classes come from a
+fixed list and are stored by name; of any other callable only the name is stored, and loading asks for it again.
+"""
+
+import io
+import json
+import os
+import pathlib
+import tempfile
+import zipfile
+from typing import Any, BinaryIO
+
+import numpy as np
+import torch as th
+from stable_baselines3 import DDPG, SAC, TD3
+from stable_baselines3.common import noise
+
+from sb3_skillgraph.version import __version__
+
+SCHEMA = 1
+PathOrFile = str | pathlib.Path | io.BufferedIOBase | BinaryIO
+
+_CLASSES: dict[str, type] = {
+    cls.__name__: cls
+    for cls in (
+        *(DDPG, TD3, SAC, noise.NormalActionNoise, noise.OrnsteinUhlenbeckActionNoise, noise.VectorizedActionNoise),
+        *(th.nn.ReLU, th.nn.LeakyReLU, th.nn.ELU, th.nn.GELU, th.nn.SiLU, th.nn.Tanh, th.nn.Sigmoid, th.nn.Softplus),
+        *(th.optim.Adam, th.optim.AdamW, th.optim.SGD, th.optim.RMSprop),
+    )
+}
+_NOISES = (noise.NormalActionNoise, noise.OrnsteinUhlenbeckActionNoise, noise.VectorizedActionNoise)
+
+
+def known_class(cls: type) -> type:
+    """Let a class of this library be stored by name (a decorator)."""
+    _CLASSES[cls.__name__] = cls
+    return cls
+
+
+class MissingCallable:
+    """Stands in a loaded tree for something that is stored by name only and must be given again.
+
+    :param name: its name
+    """
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+
+
+class _Encoder:
+    """Turns a tree into JSON and one array per dtype, into which all arrays of that dtype are strung."""
+
+    def __init__(self) -> None:
+        self.parts: dict[str, list[np.ndarray]] = {}
+        self.sizes: dict[str, int] = {}
+
+    def encode(self, tree: Any) -> Any:
+        if tree is None or isinstance(tree, bool | int | float | str):
+            return tree
+        if isinstance(tree, np.generic):
+            return tree.item()
+        if isinstance(tree, th.Tensor):
+            return {"__tensor__": self._array(tree.detach().cpu().numpy())}
+        if isinstance(tree, np.ndarray):
+            return {"__array__": self._array(tree)}
+        if isinstance(tree, tuple):
+            return {"__tuple__": [self.encode(item) for item in tree]}
+        if isinstance(tree, list):
+            return [self.encode(item) for item in tree]
+        if isinstance(tree, dict):
+            if all(isinstance(key, str) and not key.startswith("__") for key in tree):
+                return {key: self.encode(value) for key, value in tree.items()}
+            return {"__pairs__": [[self.encode(key), self.encode(value)] for key, value in tree.items()]}
+        if isinstance(tree, _NOISES):
+            return {"__object__": [type(tree).__name__, self.encode(vars(tree))]}
+        if isinstance(tree, type) and _CLASSES.get(tree.__name__) is tree:
+            return {"__class__": tree.__name__}
+        return {"__callable__": getattr(tree, "__qualname__", type(tree).__qualname__)}
+
+    def _array(self, array: np.ndarray) -> list[Any]:
+        dtype = array.dtype.str
+        if array.dtype.hasobject:
+            raise ValueError(f"An array of Python objects cannot be saved: {array!r}")
+        start = self.sizes.get(dtype, 0)
+        self.parts.setdefault(dtype, []).append(np.ascontiguousarray(array).ravel())
+        self.sizes[dtype] = start + array.size
+        return [dtype, start, list(array.shape)]
+
+
+def _decode(tree: Any, arrays: dict[str, np.ndarray]) -> Any:
+    if isinstance(tree, list):
+        return [_decode(item, arrays) for item in tree]
+    if not isinstance(tree, dict):
+        return tree
+    if len(tree) == 1:
+        ((key, value),) = tree.items()
+        if key in ("__array__", "__tensor__"):
+            dtype, start, shape = value
+            size = int(np.prod(shape, dtype=np.int64))
+            array = arrays[dtype][start : start + size].reshape(shape).copy()
+            return th.from_numpy(array) if key == "__tensor__" else array
+        if key == "__tuple__":
+            return tuple(_decode(item, arrays) for item in value)
+        if key == "__pairs__":
+            return {_decode(k, arrays): _decode(v, arrays) for k, v in value}
+        if key == "__class__":
+            return _CLASSES[value]
+        if key == "__callable__":
+            return MissingCallable(value)
+        if key == "__object__":
+            name, attributes = value
+            if _CLASSES.get(name) not in _NOISES:
+                raise ValueError(f"it names an object of unknown class {name!r}")
+            restored = object.__new__(_CLASSES[name])
+            vars(restored).update(_decode(attributes, arrays))
+            return restored
+    return {key: _decode(value, arrays) for key, value in tree.items()}
+
+
+def save_tree(path: PathOrFile, kind: str, tree: dict[str, Any], suffix: str = ".zip") -> None:
+    """Write a tree; a file is written beside its place and then renamed, so that the old one stays until the new is whole.
+
+    :param path: path (``suffix`` is added if it has none) or binary file object
+    :param kind: what the file holds, checked on loading
+    :param tree: the data
+    :param suffix: file name ending
+    :raises ValueError: if the tree holds something that is no plain data
+    :raises OSError: if the file cannot be written; an old file of that name is then untouched
+    """
+    encoder = _Encoder()
+    document = {"schema": SCHEMA, "kind": kind, "version": __version__, "tree": encoder.encode(tree)}
+    if not isinstance(path, str | pathlib.Path):
+        _write(path, document, encoder)
+        return
+    path = pathlib.Path(path)
+    path = path.with_name(path.name + suffix) if path.suffix == "" else path
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            _write(file, document, encoder)
+            file.flush()
+            os.fsync(file.fileno())
+        os.chmod(temporary, 0o644)
+        os.replace(temporary, path)
+    except BaseException:
+        pathlib.Path(temporary).unlink(missing_ok=True)
+        raise
+
+
+def _write(file: Any, document: dict[str, Any], encoder: _Encoder) -> None:
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
+        archive.writestr("agent.json", json.dumps(document))
+        for dtype, parts in encoder.parts.items():
+            with archive.open(f"arrays/{dtype[1:]}.npy", "w", force_zip64=True) as member:
+                np.lib.format.write_array(member, np.concatenate(parts), allow_pickle=False)  # type: ignore[no-untyped-call]
+
+
+def load_tree(path: PathOrFile, kind: str, suffix: str = ".zip") -> dict[str, Any]:
+    """Read a tree; nothing in the file is ever executed.
+
+    :param path: path (with or without ``suffix``) or binary file object
+    :param kind: what the file must hold
+    :param suffix: file name ending
+    :return: the data
+    :raises FileNotFoundError: if there is no such file
+    :raises ValueError: if the file is damaged, of another kind, or of a newer schema
+    """
+    if isinstance(path, str | pathlib.Path):
+        given = pathlib.Path(path)
+        path = given if given.exists() else given.with_name(given.name + suffix)
+        if not path.is_file():
+            raise FileNotFoundError(f"There is no file {str(given)!r}, nor {str(path)!r}.")
+    try:
+        with zipfile.ZipFile(path) as archive:  # type: ignore[arg-type]
+            return _read(archive, kind)
+    except FileNotFoundError:
+        raise
+    except Exception as error:  # whatever a damaged file makes zipfile, json or NumPy raise
+        name = str(path) if isinstance(path, pathlib.Path) else "the given file"
+        raise ValueError(
+            f"Cannot load {name}: {error}. It must be a whole file written by sb3_skillgraph (kind {kind!r}); files of "
+            "other programs, and damaged ones, are not read, and nothing in them is executed."
+        ) from error
+
+
+def _read(archive: zipfile.ZipFile, kind: str) -> dict[str, Any]:
+    if "agent.json" not in archive.namelist():
+        raise ValueError("it holds no agent.json")
+    document = json.loads(archive.read("agent.json"))
+    if document["schema"] > SCHEMA:
+        raise ValueError(
+            f"it was written by sb3_skillgraph {document['version']} in schema {document['schema']}, newer than the "
+            f"schema {SCHEMA} that this version ({__version__}) reads: upgrade sb3_skillgraph"
+        )
+    if document["kind"] != kind:
+        raise ValueError(f"it holds a {document['kind']!r}, not a {kind!r}")
+    arrays = {}
+    for name in archive.namelist():
+        if name.endswith(".npy"):
+            with archive.open(name) as member:
+                array = np.lib.format.read_array(member, allow_pickle=False)  # type: ignore[no-untyped-call]
+                member.read()  # to the end, so that zipfile checks the CRC
+            arrays[array.dtype.str] = array
+    return _decode(document["tree"], arrays)

@@ -1,0 +1,261 @@
+"""Where the agent has been, in goal space, and how long it took from one place to the next."""
+
+from typing import Any
+
+import numpy as np
+
+
+class VisitedStates:
+    """Trajectories through goal space, thinned to one point per ``spacing``.
+
+    Three parts of the algorithm read it: salience proposes events on visited states (section 3.2.1), the planner asks
+    which event the agent had last passed when it came near a goal (section 3.2.3: nearness in steps, which walls
+    cannot fool as they fool the Euclidean distance), and the logger asks how much of the visited space the graph covers.
+
+    Every point carries the label of the event it lies in (``-1`` for none). When the memory is full, its older half
+    is forgotten.
+
+    :param goal_dim: dimension of goal space
+    :param spacing: distance the agent must move before another point is kept, in goal units
+    :param n_envs: number of environments that write trajectories
+    :param capacity: number of points kept
+    """
+
+    def __init__(self, goal_dim: int, spacing: float, n_envs: int = 1, capacity: int = 200_000) -> None:
+        self.goal_dim = goal_dim
+        self.spacing = spacing
+        self.capacity = capacity
+        self.size = 0
+        self._points = np.zeros((1024, goal_dim), dtype=np.float32)
+        self._trajectory = np.zeros(1024, dtype=np.int64)
+        self._step = np.zeros(1024, dtype=np.int64)
+        self._label = np.zeros(1024, dtype=np.int32)
+        self._current = np.arange(n_envs, dtype=np.int64)  # trajectory that each env is writing
+        self._last_point = np.full((n_envs, goal_dim), np.nan, dtype=np.float32)
+        self._n_trajectories = n_envs
+        self._centers = np.zeros((0, goal_dim), dtype=np.float64)
+        self._radii = np.zeros(0, dtype=np.float64)
+        self._passed: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None = None
+
+    @property
+    def points(self) -> np.ndarray:
+        """Visited points, shape ``(size, goal_dim)``, oldest first."""
+        return self._points[: self.size]
+
+    def record(self, env_index: int, step: int, point: np.ndarray, done: bool = False) -> None:
+        """Extend the trajectory of one environment.
+
+        :param env_index: which environment
+        :param step: environment step at which the point was reached (any clock that counts steps)
+        :param point: position in goal space, shape ``(goal_dim,)``
+        :param done: whether the trajectory ends here
+        """
+        moved = point - self._last_point[env_index]
+        if done or not float(moved @ moved) < self.spacing**2:  # NaN, before the first point, counts as moved
+            self._append(env_index, step, point)
+        if done:
+            self._cut(env_index)
+
+    def cut(self, n_envs: int) -> None:
+        """End every running trajectory: what is recorded next does not follow from what was recorded last.
+
+        :param n_envs: number of environments from now on
+        """
+        self._current = np.zeros(n_envs, dtype=np.int64)
+        self._last_point = np.zeros((n_envs, self.goal_dim), dtype=np.float32)
+        for env_index in range(n_envs):
+            self._cut(env_index)
+
+    def _cut(self, env_index: int) -> None:
+        self._current[env_index] = self._n_trajectories
+        self._n_trajectories += 1
+        self._last_point[env_index] = np.nan
+
+    def _append(self, env_index: int, step: int, point: np.ndarray) -> None:
+        if self.size >= self.capacity:
+            self._forget_older_half()
+        if self.size == len(self._step):
+            for name in ("_points", "_trajectory", "_step", "_label"):
+                array = getattr(self, name)
+                setattr(self, name, np.concatenate([array, np.zeros_like(array)]))
+        i = self.size
+        self._points[i] = point
+        self._trajectory[i] = self._current[env_index]
+        self._step[i] = step
+        self._label[i] = self.label(np.asarray(point)[None])[0]
+        self._last_point[env_index] = point
+        self.size += 1
+        self._passed = None
+
+    def _forget_older_half(self) -> None:
+        keep = slice(self.size // 2, self.size)
+        n = self.size - self.size // 2
+        for name in ("_points", "_trajectory", "_step", "_label"):
+            array = getattr(self, name)
+            array[:n] = array[keep].copy()
+        self.size = n
+
+    def set_events(self, centers: np.ndarray, radii: np.ndarray) -> None:
+        """Relabel the points after the list of events has changed.
+
+        :param centers: shape ``(n_events, goal_dim)``
+        :param radii: shape ``(n_events,)``
+        """
+        self._centers = np.asarray(centers, dtype=np.float64).reshape(-1, self.goal_dim)
+        self._radii = np.asarray(radii, dtype=np.float64)
+        self._label[: self.size] = self.label(self.points)
+        self._passed = None
+
+    def label(self, points: np.ndarray) -> np.ndarray:
+        """Return the event each point lies in.
+
+        :param points: shape ``(n, goal_dim)``
+        :return: int array of shape ``(n,)``: index of the nearest event that contains the point, ``-1`` for none
+        """
+        best = np.full(len(points), -1, dtype=np.int32)
+        nearest = np.full(len(points), np.inf)
+        if len(points) <= 8:  # one point against many events: the per-step path
+            if len(self._radii) == 0:
+                return best
+            offsets = np.asarray(points, dtype=np.float64)[:, None] - self._centers
+            squared = np.einsum("ijk,ijk->ij", offsets, offsets)
+            squared[squared > self._radii**2] = np.inf
+            closest = squared.argmin(axis=1)
+            return np.where(np.isfinite(squared[np.arange(len(points)), closest]), closest, -1).astype(np.int32)
+        for k, (center, radius) in enumerate(zip(self._centers, self._radii, strict=True)):
+            offsets = points - center
+            squared = np.einsum("ij,ij->i", offsets, offsets)
+            inside = (squared <= radius**2) & (squared < nearest)
+            best[inside] = k
+            nearest[inside] = squared[inside]
+        return best
+
+    def near(self, point: np.ndarray, radius: float) -> np.ndarray:
+        """Return the indices of visited points within ``radius`` of a point; of the nearest one if there are none.
+
+        :param point: shape ``(goal_dim,)``
+        :param radius: distance in goal units
+        :return: int array, empty only while nothing has been visited
+        """
+        if self.size == 0:
+            return np.zeros(0, dtype=np.int64)
+        offsets = self.points - np.asarray(point, dtype=np.float32)
+        squared = np.einsum("ij,ij->i", offsets, offsets)
+        inside = np.flatnonzero(squared <= radius**2)
+        return inside if len(inside) else squared.argmin(keepdims=True)
+
+    def _events_passed(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """For each point: the last event before it on its trajectory, steps since; the next one, steps until."""
+        if self._passed is None:
+            n = self.size
+            # Trajectories of parallel environments interleave: walk them one after the other.
+            order = np.lexsort((self._step[:n], self._trajectory[:n]))
+            trajectory, step, label = self._trajectory[:n][order], self._step[:n][order], self._label[:n][order]
+            position = np.arange(n)
+            before = np.maximum.accumulate(np.where(label >= 0, position, -1))
+            after = np.minimum.accumulate(np.where(label >= 0, position, n)[::-1])[::-1]
+            columns = []
+            for pointer, exists in ((before, before >= 0), (after, after < n)):
+                pointer = np.where(exists, pointer, 0)
+                exists = exists & (trajectory[pointer] == trajectory)
+                event = np.empty(n, dtype=np.int32)
+                steps = np.empty(n, dtype=np.int64)
+                event[order] = np.where(exists, label[pointer], -1)
+                steps[order] = np.abs(step - step[pointer])
+                columns += [event, steps]
+            self._passed = (columns[0], columns[1], columns[2], columns[3])
+        return self._passed
+
+    def events_before(self, point: np.ndarray, radius: float) -> dict[int, int]:
+        """Return the events last passed on the way to a point, with the fewest steps from each.
+
+        :param point: shape ``(goal_dim,)``
+        :param radius: how near a trajectory must come to the point, in goal units
+        :return: event index -> steps, fewest first
+        """
+        event, steps, _, _ = self._events_passed()
+        return _fewest(event, steps, self.near(point, radius))
+
+    def events_after(self, point: np.ndarray, radius: float) -> dict[int, int]:
+        """Return the events reached next from a point, with the fewest steps to each.
+
+        :param point: shape ``(goal_dim,)``
+        :param radius: how near a trajectory must come to the point, in goal units
+        :return: event index -> steps, fewest first
+        """
+        _, _, event, steps = self._events_passed()
+        return _fewest(event, steps, self.near(point, radius))
+
+    def steps_between(self, start: np.ndarray, goal: np.ndarray, radius: float) -> float:
+        """Return the fewest steps any trajectory took from near one point to near another.
+
+        :param start: shape ``(goal_dim,)``
+        :param goal: shape ``(goal_dim,)``
+        :param radius: how near a trajectory must come, in goal units
+        :return: environment steps; ``inf`` if no trajectory passed both in this order
+        """
+        if self.size == 0:
+            return float("inf")
+        here, there = self.near(start, radius), self.near(goal, radius)
+        # One sortable key for (trajectory, step): the first passage of the goal after each passage of the start.
+        span = int(self._step[: self.size].max()) + 1
+        there_key = np.sort(self._trajectory[there] * span + self._step[there])
+        here_key = self._trajectory[here] * span + self._step[here]
+        following = np.searchsorted(there_key, here_key)
+        found = following < len(there_key)
+        arrival = there_key[following[found]]
+        departure = here_key[found]
+        same = arrival // span == departure // span
+        return float((arrival - departure)[same].min()) if same.any() else float("inf")
+
+    def rewind(self, index: int, max_steps: int) -> int:
+        """Walk back along a trajectory until at most ``max_steps`` lie behind the last event passed.
+
+        :param index: index of a visited point
+        :param max_steps: environment steps
+        :return: index of a visited point on the same trajectory, not later than ``index``
+        """
+        _, steps, _, _ = self._events_passed()
+        n = self.size
+        same = np.flatnonzero(
+            (self._trajectory[:n] == self._trajectory[index])
+            & (self._step[:n] <= self._step[index])
+            & (self._step[:n] >= self._step[index] - steps[index])
+            & (steps <= max_steps)
+        )
+        return int(same[self._step[same].argmax()]) if len(same) else index
+
+    def get_state(self) -> dict[str, Any]:
+        """Return the memory as plain data."""
+        n = self.size
+        return {
+            "points": self._points[:n],
+            "trajectory": self._trajectory[:n],
+            "step": self._step[:n],
+            "current": self._current,
+            "last_point": self._last_point,
+            "n_trajectories": self._n_trajectories,
+        }
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Restore what :meth:`get_state` returned; the events must be set again afterwards."""
+        self._points = np.array(state["points"], dtype=np.float32)
+        self._trajectory = np.array(state["trajectory"], dtype=np.int64)
+        self._step = np.array(state["step"], dtype=np.int64)
+        self.size = len(self._step)
+        self._label = np.full(self.size, -1, dtype=np.int32)
+        self._current = np.array(state["current"], dtype=np.int64)
+        self._last_point = np.array(state["last_point"], dtype=np.float32)
+        self._n_trajectories = int(state["n_trajectories"])
+        self._passed = None
+        if self.size == 0:
+            self.__init__(self.goal_dim, self.spacing, len(self._current), self.capacity)  # type: ignore[misc]
+
+
+def _fewest(event: np.ndarray, steps: np.ndarray, indices: np.ndarray) -> dict[int, int]:
+    indices = indices[event[indices] >= 0]
+    indices = indices[np.argsort(steps[indices], kind="stable")]
+    fewest: dict[int, int] = {}
+    for i in indices:
+        fewest.setdefault(int(event[i]), int(steps[i]))
+    return fewest
