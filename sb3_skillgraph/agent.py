@@ -1,6 +1,6 @@
 """The agent: an SB3 off-policy algorithm that discovers, plans, chains and learns (section 3, Figure 10)."""
 
-from typing import Any, ClassVar, Literal, TypeVar
+from typing import Any, ClassVar, Literal, NamedTuple, TypeVar
 
 import numpy as np
 import torch as th
@@ -14,23 +14,15 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.vec_env import unwrap_vec_normalize
 from stable_baselines3.td3.policies import MultiInputPolicy
 
-from sb3_skillgraph.chaining import DeepSkillChaining
-from sb3_skillgraph.controller import GLOBAL, UNDECIDED, Controller, ControllerState, Request
-from sb3_skillgraph.curriculum import Curriculum, Strategy
-from sb3_skillgraph.events import SalientEvent, TerminationSet
-from sb3_skillgraph.goal_env import KEYS, GoalSpec, Oracle, check_finite, env_attribute, find_view, rows
-from sb3_skillgraph.graph import SkillGraph
+from sb3_skillgraph.assembly import Assembly
+from sb3_skillgraph.controller import GLOBAL, UNDECIDED, ControllerState, Request
+from sb3_skillgraph.goal_env import KEYS, GoalSpec, check_finite, rows
 from sb3_skillgraph.interrupts import uninterrupted
-from sb3_skillgraph.options.factory import OptionFactory, copy_policy
-from sb3_skillgraph.options.learner import OptionDDPG, OptionLearner
+from sb3_skillgraph.options.learner import OptionDDPG
 from sb3_skillgraph.options.option import Option
-from sb3_skillgraph.options.views import ScaledView, View
-from sb3_skillgraph.persistence import Persistence
-from sb3_skillgraph.planner import GraphPlanner, Plan
-from sb3_skillgraph.replay import TransitionStore
-from sb3_skillgraph.salience.discovery import EventDiscovery
-from sb3_skillgraph.salience.proposals import FrontierSalience, RandomSalience, Salience
-from sb3_skillgraph.visited import VisitedStates
+from sb3_skillgraph.options.views import View
+from sb3_skillgraph.planner import Plan
+from sb3_skillgraph.salience.proposals import Salience
 
 SelfSkillGraphAgent = TypeVar("SelfSkillGraphAgent", bound="SkillGraphAgent")
 
@@ -63,7 +55,7 @@ PAPER: dict[str, Any] = dict(
 )
 
 
-class SkillGraphAgent(Persistence):
+class SkillGraphAgent(Assembly):
     """
     Deep Skill Graphs (DSG): discovers salient events without reward, learns options that connect them, arranges both in
     a graph and plans over it to goals never seen in training.
@@ -226,7 +218,6 @@ class SkillGraphAgent(Persistence):
         self._exploration_noise = exploration_noise
         self._random_action_prob = random_action_prob
         self._random_hold = random_hold
-        self._spec: GoalSpec | None = None
         if env is not None:
             self._spec = GoalSpec.of(self.observation_space, self.action_space)
         if self.env is not None and unwrap_vec_normalize(self.env) is not None:
@@ -236,165 +227,6 @@ class SkillGraphAgent(Persistence):
             )
         if _init_setup_model:
             self._setup_model()
-
-    # -- building -----------------------------------------------------------------------------------------------------
-
-    def _setup_model(self) -> None:
-        self._setup_lr_schedule()
-        self.set_random_seed(self.seed)
-        self._convert_train_freq()
-        args = self._arguments
-        spec = self._spec = GoalSpec.of(self.observation_space, self.action_space)
-        self.rng = np.random.default_rng(self.seed)
-        self.event_radius = self._event_radius()
-        self._view_name, function = find_view(args["option_view"], self.env)
-        self.view = ScaledView(function, self.event_radius)
-        self.store = TransitionStore(
-            self.buffer_size, spec.observation_dim, spec.goal_dim, spec.action_dim, n_envs=self.n_envs
-        )
-        # Under SB3's name as well: CheckpointCallback looks for it. Options learn from views of it.
-        self.replay_buffer = self.store  # type: ignore[assignment]
-        self._factory = OptionFactory(
-            args["option_class"],
-            self._option_kwargs(),
-            self.store,
-            self.view,
-            self._action_space(),
-            self.event_radius,
-            self.rng,
-            dict(hindsight=args["hindsight"], shared=args["shared_experience"], horizon=args["option_timeout"]),
-            self.device,
-        )
-        self.global_option = self._factory.make("global", None, None)
-        self.policy = self.global_option.learner.policy
-        self._build_skills()
-        self._build_curriculum()
-        self._begin_episodes()
-
-    def _action_space(self) -> spaces.Box:
-        assert isinstance(self.action_space, spaces.Box)
-        return self.action_space
-
-    def _event_radius(self) -> float:
-        radius = self._arguments["event_radius"]
-        for name in ("success_radius", "distance_threshold"):
-            if radius is None and self.env is not None:
-                radius = env_attribute(self.env, name)
-        if radius is None:
-            raise ValueError(
-                "event_radius is required: the environment has neither a success_radius nor a distance_threshold to take "
-                "it from. Give the distance, in goal units, within which a goal counts as reached."
-            )
-        if not float(radius) > 0:
-            raise ValueError(f"event_radius must be positive, not {radius!r}.")
-        return float(radius)
-
-    def _option_kwargs(self) -> dict[str, Any]:
-        option_class: type[OffPolicyAlgorithm] = self._arguments["option_class"]
-        kwargs: dict[str, Any] = dict(gamma=self.gamma, tau=self.tau, policy_kwargs=self.policy_kwargs)
-        if issubclass(option_class, OptionLearner):
-            if callable(self.learning_rate):
-                raise ValueError(
-                    f"{option_class.__name__} takes constant learning rates; for a schedule use option_class=TD3 or SAC."
-                )
-            kwargs.update(actor_learning_rate=self.learning_rate, critic_learning_rate=self.learning_rate)
-        else:
-            kwargs.update(learning_rate=self.learning_rate)
-        return {**kwargs, **(self._arguments["option_kwargs"] or {})}
-
-    def _build_skills(self) -> None:
-        args = self._arguments
-        spec = self._spec
-        assert spec is not None
-        self.graph = SkillGraph(
-            args["containment"], args["rate_prior"], args["evidence_edges"], args["min_success_rate"]
-        )
-        self.visited = VisitedStates(spec.goal_dim, 0.25 * self.event_radius, self.n_envs)
-        self.planner = GraphPlanner(self.graph, self.visited, self.event_radius, args["event_reach"], args["nearest"])
-        self.chaining = DeepSkillChaining(
-            self.graph, self._make_option, self._matured, args["gestation_period"], args["max_failures"]
-        )
-        self.controller = Controller(
-            self.global_option,
-            self.chaining,
-            self.planner,
-            self.view,
-            self.event_radius,
-            args["option_timeout"],
-            args["warm_start"],
-        )
-
-    def _build_curriculum(self) -> None:
-        args = self._arguments
-        self.discovery = EventDiscovery(
-            self.graph,
-            self._salience(),
-            self.event_radius,
-            args["salient_event_freq"],
-            args["retry_after"],
-            args["events_per_attempt"],
-            args["event_tries"],
-            args["max_unconnected"],
-        )
-        strategy = Strategy(**{name: args[name] for name in Strategy._fields})
-        self.curriculum = Curriculum(
-            self.graph,
-            self.chaining,
-            self.planner,
-            self.visited,
-            self.discovery,
-            strategy,
-            args["option_timeout"],
-            self.rng,
-            self.n_envs,
-        )
-
-    def _salience(self) -> Salience:
-        salience = self._arguments["salience"]
-        if salience == "frontier":
-            return FrontierSalience(self.visited, 2.0 * self.event_radius, self._arguments["event_reach"])
-        if salience == "rrt":
-            return RandomSalience(Oracle(self.get_env))
-        if not hasattr(salience, "propose"):
-            raise ValueError(
-                f"Unknown salience {salience!r}: use 'frontier', 'rrt' or an object with a method propose(rng) that "
-                "returns a point of goal space."
-            )
-        return salience  # type: ignore[no-any-return]
-
-    def _make_option(self, target: str, termination: TerminationSet) -> Option:
-        return self._factory.make(f"o{len(self.chaining.options) + 1}", target, termination)
-
-    def _matured(self, option: Option) -> None:
-        if self._arguments["warm_start"]:
-            copy_policy(self.global_option, option)
-
-    def _begin_episodes(self) -> None:
-        """Forget what the environments were in the middle of."""
-        spec = self._spec
-        assert spec is not None
-        self._state = ControllerState.fresh(self.n_envs)
-        self._held_actions = np.zeros((self.n_envs, spec.action_dim), dtype=np.float32)
-        self._hold_left = np.zeros(self.n_envs, dtype=np.int64)
-        self._pending: _Pending | None = None
-        self._executed: list[int] = []
-        self._credit = 0.0
-
-    # -- what users look at -------------------------------------------------------------------------------------------
-
-    @property
-    def events(self) -> list[SalientEvent]:
-        """All salient events in the order of their discovery."""
-        return list(self.graph.events.values())
-
-    @property
-    def planning(self) -> bool:
-        """Whether ``predict`` plans over the graph; if not, the global option walks straight to every goal."""
-        return self.controller.planning
-
-    @planning.setter
-    def planning(self, planning: bool) -> None:
-        self.controller.planning = planning
 
     # -- learning: SB3's hooks ----------------------------------------------------------------------------------------
 
@@ -420,7 +252,7 @@ class SkillGraphAgent(Persistence):
         :return: the agent
         :raises ValueError: if an observation holds NaN or inf
         """
-        return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+        return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)  # type: ignore[arg-type]
 
     def _setup_learn(
         self,
@@ -438,9 +270,7 @@ class SkillGraphAgent(Persistence):
             self._last_obs = None
         resumed = not reset_num_timesteps and self._restore_env()
         goes_on = resumed or (not reset_num_timesteps and self._last_obs is not None)
-        total, callback = super()._setup_learn(
-            total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
-        )
+        total, callback = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
         assert isinstance(self._last_obs, dict)
         if not goes_on:
             check_finite(self._last_obs, self.num_timesteps)
@@ -504,8 +334,9 @@ class SkillGraphAgent(Persistence):
         """Store the step once, and let everything learn from it."""
         assert isinstance(new_obs, dict)
         reached = _with_terminal(new_obs, dones, infos)
-        check_finite(reached, self.num_timesteps)
         check_finite(new_obs, self.num_timesteps)
+        if reached is not new_obs:
+            check_finite(reached, self.num_timesteps)
         with uninterrupted():
             self._learn_from_step(reached, dones, infos)
             self._last_obs = new_obs
@@ -665,7 +496,6 @@ class SkillGraphAgent(Persistence):
         return self.planner.plan(batch["achieved_goal"][0], target, self.event_radius)
 
     def _checked_goal(self, goal: np.ndarray) -> np.ndarray:
-        assert self._spec is not None
         array = np.asarray(goal, dtype=np.float64)
         if array.shape != (self._spec.goal_dim,) or not np.isfinite(array).all():
             raise ValueError(f"A goal must be a finite vector of shape ({self._spec.goal_dim},), not {goal!r}.")
@@ -706,26 +536,16 @@ class SkillGraphAgent(Persistence):
             self.env.set_options()
 
 
-class _Pending:
+class _Pending(NamedTuple):
     """A step between its taking and its storing."""
 
-    def __init__(
-        self,
-        observation: dict[str, np.ndarray],
-        action: np.ndarray,
-        aims: np.ndarray,
-        state: ControllerState,
-        held_actions: np.ndarray,
-        hold_left: np.ndarray,
-        rng_state: Any,
-    ) -> None:
-        self.observation = observation
-        self.action = action
-        self.aims = aims
-        self.state = state
-        self.held_actions = held_actions
-        self.hold_left = hold_left
-        self.rng_state = rng_state
+    observation: dict[str, np.ndarray]
+    action: np.ndarray
+    aims: np.ndarray
+    state: ControllerState
+    held_actions: np.ndarray
+    hold_left: np.ndarray
+    rng_state: Any
 
 
 def _with_terminal(new_obs: dict[str, np.ndarray], dones: np.ndarray, infos: list[dict[str, Any]]) -> dict[str, np.ndarray]:

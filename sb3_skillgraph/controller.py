@@ -139,14 +139,14 @@ class Controller:
         :return: the state, undecided where an option ended; one outcome per option that ended
         """
         state, outcomes = state.copy(), []
-        for i in np.flatnonzero(state.option != UNDECIDED):
+        for i in np.flatnonzero(state.option != UNDECIDED).tolist():
             index, aim, steps = int(state.option[i]), int(state.aim[i]), int(state.steps[i])
             timeout = self.timeout if index != GLOBAL else self.timeout // 2
             ended = fate(self._termination(index, aim, requests[i]), points[i], steps, timeout)
             if ended == Fate.RUNNING:
                 continue
             success = ended == Fate.SUCCEEDED
-            outcomes.append(OptionOutcome(int(i), index, aim, success, steps))
+            outcomes.append(OptionOutcome(i, index, aim, success, steps))
             state.option[i] = UNDECIDED
             state.avoid[i] = -1 if success or index == GLOBAL else index
             state.failures[i] += not success and index == GLOBAL
@@ -175,7 +175,7 @@ class Controller:
         """
         state = state.copy()
         points = observation["achieved_goal"]
-        for i in np.flatnonzero(state.option == UNDECIDED):
+        for i in np.flatnonzero(state.option == UNDECIDED).tolist():
             state.option[i], state.aim[i] = self.choose(points[i], requests[i], int(state.failures[i]), int(state.avoid[i]))
             state.steps[i] = 0
         aims = np.stack([self._aim(int(o), int(a), r) for o, a, r in zip(state.option, state.aim, requests, strict=True)])

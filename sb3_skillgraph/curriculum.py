@@ -14,6 +14,8 @@ from sb3_skillgraph.planner import GraphPlanner
 from sb3_skillgraph.salience.discovery import EventDiscovery
 from sb3_skillgraph.visited import VisitedStates
 
+N_EXPLORED = 10  # candidates for an exploration
+
 
 class Strategy(NamedTuple):
     """How targets are chosen; the fields are arguments of :class:`~sb3_skillgraph.SkillGraphAgent`, described there."""
@@ -29,14 +31,15 @@ class Strategy(NamedTuple):
 
 @dataclass
 class Mission:
-    """What one environment's agent is about.
+    """What one environment's agent is about: to reach an event or a point, and perhaps to explore from there.
 
     :param goal: where to go, shape ``(goal_dim,)``
-    :param event: id of the target event; None for a point to explore towards
+    :param event: id of the target event; None for any other point
     :param chain: id of the chain to practise
     :param left_graph: whether the chain's source has been reached
-    :param explore_steps: steps of exploration to be done at the target event (or, without one, towards the goal)
-    :param random: whether exploration is a random walk rather than a walk towards a goal
+    :param explore_steps: environment steps to explore on arrival
+    :param beyond: the point to explore towards; None for a random walk
+    :param exploring: whether exploration has begun
     :param n_failures: options that timed out during the mission
     """
 
@@ -45,18 +48,21 @@ class Mission:
     chain: str | None = None
     left_graph: bool = False
     explore_steps: int = 0
-    random: bool = False
+    beyond: np.ndarray | None = None
+    exploring: bool = False
     n_failures: int = 0
 
     @property
     def request(self) -> Request:
         """The mission as the controller sees it."""
-        return Request(self.goal, self.event, self.chain, self.left_graph, direct=self.event is None)
+        if self.exploring:
+            return Request(self.goal if self.beyond is None else self.beyond, direct=True)
+        return Request(self.goal, self.event, self.chain, self.left_graph)
 
     @property
     def random_walk(self) -> bool:
         """Whether actions are to be random now."""
-        return self.event is None and self.random
+        return self.exploring and self.beyond is None
 
 
 class Curriculum:
@@ -153,9 +159,7 @@ class Curriculum:
         events = list(self.graph.events.values())
         self.visited.set_events(np.stack([e.center for e in events]), np.array([e.radius for e in events]))
 
-    def observe(
-        self, env: int, before: np.ndarray, after: np.ndarray, outcome: OptionOutcome | None, done: bool
-    ) -> bool:
+    def observe(self, env: int, before: np.ndarray, after: np.ndarray, outcome: OptionOutcome | None, done: bool) -> bool:
         """Learn from one environment step.
 
         :param env: which environment
@@ -172,6 +176,7 @@ class Curriculum:
         if outcome is not None:
             self._learn(env, outcome, after)
             mission.n_failures += not outcome.success
+        was_exploring = mission.exploring
         over = self._mission_over(mission, after)
         if over or done:
             self._missions[env] = None
@@ -180,7 +185,7 @@ class Curriculum:
         if done:
             self.n_episodes += 1
             self._since_event[env], self._last_event[env] = [], None
-        return over or done
+        return over or done or mission.exploring != was_exploring
 
     def _learn(self, env: int, outcome: OptionOutcome, end: np.ndarray) -> None:
         if outcome.option == GLOBAL:
@@ -193,16 +198,14 @@ class Curriculum:
             self.chaining.learn_failure(option, path[0])
 
     def _mission_over(self, mission: Mission, point: np.ndarray) -> bool:
-        """Whether a mission has ended; an exploration begins at its event, and ends after its steps."""
-        if mission.event is None:
+        """Whether a mission has ended; an exploration begins on arrival, and ends after its steps."""
+        if mission.exploring:
             mission.explore_steps -= 1
             return mission.explore_steps <= 0
-        if self.graph.events[mission.event].contains(point[None])[0]:
-            if mission.explore_steps <= 0:
-                return True
-            mission.event, mission.n_failures = None, 0
-            return False
-        return mission.n_failures >= self.strategy.max_tries
+        if np.linalg.norm(point - mission.goal) > self.discovery.radius:
+            return mission.n_failures >= self.strategy.max_tries
+        mission.exploring = mission.explore_steps > 0
+        return not mission.exploring
 
     # -- events passed ------------------------------------------------------------------------------------------------
 
@@ -308,19 +311,20 @@ class Curriculum:
         return min(chains, key=cost, default=None)
 
     def _explore(self) -> Mission:
-        """Go to the event nearest to a random point, and on from there: towards the point, or at random.
+        """Return to where the agent has rarely been, and go on from there: at random, or towards a random point.
 
-        It is the RRT's way to extend the tree (section 2.4), by skills instead of a model.
+        Of some visited states, drawn as an RRT draws them (section 2.4: those nearest to uniform random points), it is
+        the one with the fewest visits around it.
         """
+        steps = self.strategy.exploration_steps
         if self.visited.size < 2:
-            return Mission(self.graph.events["e0"].center, None, explore_steps=self.strategy.exploration_steps, random=True)
-        points = self.visited.points
-        margin = 4.0 * self.discovery.radius
-        goal = self.rng.uniform(points.min(axis=0) - margin, points.max(axis=0) + margin)
-        nearest = min(self.graph.events.values(), key=lambda event: float(np.linalg.norm(event.center - goal)))
-        return Mission(
-            goal, nearest.id, explore_steps=self.strategy.exploration_steps, random=bool(self.rng.random() < 0.5)
-        )
+            return Mission(self.graph.events["e0"].center, explore_steps=steps, exploring=True)
+        points, radius = self.visited.points, self.discovery.radius
+        samples = self.rng.uniform(points.min(axis=0) - radius, points.max(axis=0) + radius, (N_EXPLORED, points.shape[1]))
+        nearest = [points[self.visited.near(sample, 0.0)[0]] for sample in samples]
+        rarest = int(np.argmin([len(self.visited.near(point, radius)) for point in nearest]))
+        beyond = samples[rarest] if self.rng.random() < 0.5 else None
+        return Mission(nearest[rarest].astype(np.float64), explore_steps=steps, beyond=beyond)
 
     # -- saving -------------------------------------------------------------------------------------------------------
 

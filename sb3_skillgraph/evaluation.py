@@ -131,10 +131,10 @@ def evaluate_pairs(
         env.close()
 
 
-def _adapted(agent: Any, start: np.ndarray, goal: np.ndarray, total_timesteps: int) -> Predictor:
-    adapted: Any = copy.deepcopy(agent)
+def _adapted(agent: Any, start: np.ndarray, goal: np.ndarray, total_timesteps: int) -> Any:
+    adapted = copy.deepcopy(agent)
     adapted.adapt(goal, start=start, total_timesteps=total_timesteps)
-    return adapted  # type: ignore[no-any-return]
+    return adapted
 
 
 def _run_pair(agent: Predictor, env: gym.Env, start: np.ndarray, goal: np.ndarray, cells: float) -> PairResult:

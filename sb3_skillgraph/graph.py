@@ -1,5 +1,6 @@
 """The skill graph: a thin layer over one ``networkx.DiGraph`` (sections 3.1, 3.2.6, A.2)."""
 
+import itertools
 from collections import deque
 from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
@@ -138,6 +139,7 @@ class SkillGraph:
 
     def _edges_out_of(self, option: Option) -> None:
         rate = option.success_rate(self.rate_prior)
+        assert option.target is not None, "The global option is no vertex."
         rates = {option.target: rate}
         if option.effects:
             effects = np.stack(option.effects)
@@ -236,7 +238,7 @@ class SkillGraph:
 
     def success_probability(self, vertices: Sequence[str]) -> float:
         """Return the product of the success rates along a path."""
-        rates = [self.nx.edges[edge]["success_rate"] for edge in zip(vertices[:-1], vertices[1:], strict=True)]
+        rates = [self.nx.edges[edge]["success_rate"] for edge in itertools.pairwise(vertices)]
         return float(np.prod(rates))
 
     def joined_pairs(self) -> float:

@@ -10,9 +10,9 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.save_util import recursive_getattr
 from stable_baselines3.common.type_aliases import GymEnv
-from stable_baselines3.common.utils import check_for_correct_spaces, recursive_getattr
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.utils import check_for_correct_spaces
 
 from sb3_skillgraph.chaining import DeepSkillChaining
 from sb3_skillgraph.controller import Controller, ControllerState
@@ -183,7 +183,7 @@ class Persistence(OffPolicyAlgorithm):
     # -- loading ------------------------------------------------------------------------------------------------------
 
     @classmethod
-    def load(  # noqa: C901 - one step after the other
+    def load(
         cls: type[SelfPersistence],
         path: PathOrFile,
         env: GymEnv | None = None,
@@ -217,7 +217,8 @@ class Persistence(OffPolicyAlgorithm):
         arguments = {**tree["arguments"], "device": device}
         arguments.update({name: value for name, value in given.items() if name in arguments or name in _signature(cls)})
         _require_callables(arguments)
-        agent = cls(env=None, _init_setup_model=False, **{"policy": "MultiInputPolicy", **arguments})
+        constructor: Any = cls  # its keyword arguments are those of the class it is part of
+        agent = constructor(env=None, _init_setup_model=False, **{"policy": "MultiInputPolicy", **arguments})
         agent.observation_space = _space(tree["spaces"]["observation"])
         agent.action_space = _space(tree["spaces"]["action"])
         agent.n_envs = tree["n_envs"]
@@ -322,7 +323,9 @@ class Persistence(OffPolicyAlgorithm):
         :raises ValueError: if a name is unknown, or missing although ``exact_match``; if a file cannot be read
         :raises RuntimeError: if the tensors do not fit
         """
-        given = load_path_or_dict if isinstance(load_path_or_dict, dict) else load_tree(load_path_or_dict, "agent")["parameters"]
+        given = (
+            load_path_or_dict if isinstance(load_path_or_dict, dict) else load_tree(load_path_or_dict, "agent")["parameters"]
+        )
         names, variables = self._get_torch_save_params()
         expected = {_public(name): name for name in names}
         unknown = set(given) - set(expected) - {"variables"}
@@ -373,4 +376,3 @@ def _space(description: dict[str, Any]) -> spaces.Space:
         return spaces.Dict({key: _space(entry) for key, entry in description["entries"].items()})
     low: np.ndarray = description["low"]
     return spaces.Box(low, description["high"], dtype=low.dtype.type)
-

@@ -1,4 +1,4 @@
-"""Planning over the skill graph: the way to an event, and the way to a goal the agent never saw (sections 3.2.3, 3.2.4, 3.3)."""
+"""Planning over the skill graph: to an event, and to a goal the agent never saw (sections 3.2.3, 3.2.4, 3.3)."""
 
 from collections.abc import Callable
 from typing import Literal, NamedTuple

@@ -113,7 +113,7 @@ def _decode(tree: Any, arrays: dict[str, np.ndarray]) -> Any:
             name, attributes = value
             if _CLASSES.get(name) not in _NOISES:
                 raise ValueError(f"it names an object of unknown class {name!r}")
-            restored = object.__new__(_CLASSES[name])
+            restored: Any = object.__new__(_CLASSES[name])
             vars(restored).update(_decode(attributes, arrays))
             return restored
     return {key: _decode(value, arrays) for key, value in tree.items()}
@@ -155,7 +155,7 @@ def _write(file: Any, document: dict[str, Any], encoder: _Encoder) -> None:
         archive.writestr("agent.json", json.dumps(document))
         for dtype, parts in encoder.parts.items():
             with archive.open(f"arrays/{dtype[1:]}.npy", "w", force_zip64=True) as member:
-                np.lib.format.write_array(member, np.concatenate(parts), allow_pickle=False)  # type: ignore[no-untyped-call]
+                np.lib.format.write_array(member, np.concatenate(parts), allow_pickle=False)
 
 
 def load_tree(path: PathOrFile, kind: str, suffix: str = ".zip") -> dict[str, Any]:
@@ -174,7 +174,7 @@ def load_tree(path: PathOrFile, kind: str, suffix: str = ".zip") -> dict[str, An
         if not path.is_file():
             raise FileNotFoundError(f"There is no file {str(given)!r}, nor {str(path)!r}.")
     try:
-        with zipfile.ZipFile(path) as archive:  # type: ignore[arg-type]
+        with zipfile.ZipFile(path) as archive:
             return _read(archive, kind)
     except FileNotFoundError:
         raise
@@ -201,7 +201,7 @@ def _read(archive: zipfile.ZipFile, kind: str) -> dict[str, Any]:
     for name in archive.namelist():
         if name.endswith(".npy"):
             with archive.open(name) as member:
-                array = np.lib.format.read_array(member, allow_pickle=False)  # type: ignore[no-untyped-call]
+                array = np.lib.format.read_array(member, allow_pickle=False)
                 member.read()  # to the end, so that zipfile checks the CRC
             arrays[array.dtype.str] = array
     return _decode(document["tree"], arrays)

@@ -154,7 +154,7 @@ class VisitedStates:
             position = np.arange(n)
             before = np.maximum.accumulate(np.where(label >= 0, position, -1))
             after = np.minimum.accumulate(np.where(label >= 0, position, n)[::-1])[::-1]
-            columns = []
+            columns: list[np.ndarray] = []
             for pointer, exists in ((before, before >= 0), (after, after < n)):
                 pointer = np.where(exists, pointer, 0)
                 exists = exists & (trajectory[pointer] == trajectory)

@@ -97,9 +97,7 @@ class MazeGeometry:
         self._is_wall = [[cell == _WALL for cell in row] for row in self.maze_map]
         self._half_width = len(self.maze_map[0]) * self.cell_size / 2
         self._half_height = len(self.maze_map) * self.cell_size / 2
-        self.free_cells = [
-            (i, j) for i, row in enumerate(self._is_wall) for j, is_wall in enumerate(row) if not is_wall
-        ]
+        self.free_cells = [(i, j) for i, row in enumerate(self._is_wall) for j, is_wall in enumerate(row) if not is_wall]
         self._corner_graphs: dict[float, _CornerGraph] = {}
 
     @property

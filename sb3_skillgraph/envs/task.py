@@ -67,9 +67,7 @@ class GoalTask(gym.Env[Any, NDArray[np.float32]]):
     #: Half side of the square of the start noise, in world units.
     start_noise: float = 0.1
 
-    def _init_task(
-        self, geometry: MazeGeometry, success_radius: float, max_steps: int, terminate_on_success: bool
-    ) -> None:
+    def _init_task(self, geometry: MazeGeometry, success_radius: float, max_steps: int, terminate_on_success: bool) -> None:
         """Set up the task.
 
         :param geometry: the maze
@@ -133,9 +131,7 @@ class GoalTask(gym.Env[Any, NDArray[np.float32]]):
         """
         return self.geometry.sample_free(rng, self.body_radius)
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Observation, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, dict[str, Any]]:
         """Begin an episode.
 
         The default start and the goal are drawn even where the options replace them, so that what later episodes draw
@@ -187,11 +183,7 @@ class GoalTask(gym.Env[Any, NDArray[np.float32]]):
         unknown = sorted(set(options) - set(margins))
         if unknown:
             raise ValueError(f"unknown reset options {unknown}: the options are 'start' and 'goal', each an (x, y)")
-        return {
-            name: self._check_position(name, value, margins[name])
-            for name, value in options.items()
-            if value is not None
-        }
+        return {name: self._check_position(name, value, margins[name]) for name, value in options.items() if value is not None}
 
     def _check_position(self, name: str, value: Any, margin: float) -> NDArray[np.float64]:
         with contextlib.suppress(TypeError, ValueError):
@@ -217,9 +209,7 @@ class GoalTask(gym.Env[Any, NDArray[np.float32]]):
         """
         return self._are_near(achieved_goal, desired_goal).astype(np.float64)
 
-    def compute_terminated(
-        self, achieved_goal: NDArray[np.float64], desired_goal: NDArray[np.float64], info: Any
-    ) -> bool:
+    def compute_terminated(self, achieved_goal: NDArray[np.float64], desired_goal: NDArray[np.float64], info: Any) -> bool:
         """Whether having reached a position ends the episode when a goal was wanted.
 
         :param achieved_goal: position reached, shape (2,)
@@ -229,9 +219,7 @@ class GoalTask(gym.Env[Any, NDArray[np.float32]]):
         """
         return self.terminate_on_success and bool(self._are_near(achieved_goal, desired_goal))
 
-    def compute_truncated(
-        self, achieved_goal: NDArray[np.float64], desired_goal: NDArray[np.float64], info: Any
-    ) -> bool:
+    def compute_truncated(self, achieved_goal: NDArray[np.float64], desired_goal: NDArray[np.float64], info: Any) -> bool:
         """Whether the time limit has been reached.
 
         :param achieved_goal: not used

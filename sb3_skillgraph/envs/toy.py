@@ -48,9 +48,7 @@ class ToyMazeEnv(GoalTask):
         self.step_size = float(step_size)
         self.render_mode = render_mode
         position = spaces.Box(-np.inf, np.inf, shape=(2,), dtype=np.float64)
-        self.observation_space = spaces.Dict(
-            {"observation": position, "achieved_goal": position, "desired_goal": position}
-        )
+        self.observation_space = spaces.Dict({"observation": position, "achieved_goal": position, "desired_goal": position})
         self.action_space = spaces.Box(-1.0, 1.0, shape=(2,), dtype=np.float32)
         self._init_task(MazeGeometry(maze_map), success_radius, max_steps, terminate_on_success)
         self._place(self.goal)

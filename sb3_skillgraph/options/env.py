@@ -13,7 +13,7 @@ from sb3_skillgraph.options.option import Option, termination_rule
 from sb3_skillgraph.options.views import VIEWS, ScaledView
 
 
-class OptionEnv(gym.Wrapper[np.ndarray, Any, dict[str, np.ndarray], Any]):
+class OptionEnv(gym.Wrapper):
     """A goal environment with the reward and the end of one option (section 2.1).
 
     ``DDPG("MlpPolicy", OptionEnv(env, event)).learn(10_000)`` trains a policy for the option by itself. The reward is -1
@@ -96,5 +96,3 @@ class OptionEnv(gym.Wrapper[np.ndarray, Any, dict[str, np.ndarray], Any]):
     def _see(self, observation: dict[str, np.ndarray]) -> np.ndarray:
         rows = [np.asarray(observation[key], dtype=np.float32).reshape(1, -1) for key in ("observation", "achieved_goal")]
         return self.view(rows[0], rows[1], self.goal[None])[0]
-
-

@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 import torch as th
 from gymnasium import spaces
+from stable_baselines3 import SAC
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
@@ -82,7 +83,11 @@ class OptionFactory:
 
     def _learner(self, replay: OptionReplay) -> OffPolicyAlgorithm:
         """Build the SB3 model without an environment, a logger's folder, or a reseeding of the global generators."""
-        learner = self.option_class("MlpPolicy", None, _init_setup_model=False, device=self.device, **self.option_kwargs)
+        kwargs = dict(self.option_kwargs)
+        if issubclass(self.option_class, SAC):
+            kwargs.setdefault("target_entropy", -float(self.action_space.low.size))  # SAC's "auto" asks an environment
+        constructor: Any = self.option_class
+        learner: OffPolicyAlgorithm = constructor("MlpPolicy", None, _init_setup_model=False, device=self.device, **kwargs)
         learner.observation_space, learner.action_space, learner.n_envs = self.observation_space, self.action_space, 1
         learner.replay_buffer = replay
         with th.random.fork_rng(devices=[]):

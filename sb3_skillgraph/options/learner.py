@@ -65,8 +65,6 @@ class OptionLearner(TD3):
         if fast is None:
             super().train(gradient_steps, batch_size)
             return
-        if not self.policy.training:
-            self.policy.set_training_mode(True)
         self._update_learning_rate([self.actor.optimizer, self.critic.optimizer])
         actor_losses, critic_losses = self._gradient_steps(fast, gradient_steps, batch_size)
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")

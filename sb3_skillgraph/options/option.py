@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.policies import BasePolicy
 
 from sb3_skillgraph.events import TerminationSet
 from sb3_skillgraph.options.initiation import InitiationSet
@@ -64,7 +65,9 @@ class Option:
     def actor(self) -> NumpyActor:
         """The policy, for roll-outs."""
         if self._actor is None:
-            self._actor = NumpyActor(self.learner.policy.actor)
+            actor = self.learner.policy.actor
+            assert isinstance(actor, BasePolicy)
+            self._actor = NumpyActor(actor)
         return self._actor
 
     def contains(self, points: np.ndarray) -> np.ndarray:

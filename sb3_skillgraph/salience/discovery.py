@@ -8,6 +8,7 @@ from sb3_skillgraph.events import SalientEvent
 from sb3_skillgraph.graph import SkillGraph
 from sb3_skillgraph.salience.proposals import Salience
 
+
 class EventDiscovery:
     """Adds salient events to the graph.
 

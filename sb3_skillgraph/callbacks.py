@@ -1,0 +1,43 @@
+"""SB3 callbacks for skill graphs."""
+
+from typing import Any
+
+from stable_baselines3.common.callbacks import ProgressBarCallback
+
+#: Environment steps between two looks at the graph.
+REFRESH_STEPS = 500
+
+
+class SkillGraphProgressBarCallback(ProgressBarCallback):
+    """SB3's progress bar that also shows events, mature options, edges and coverage.
+
+    *Coverage* is the share of visited states from which some vertex of the graph can be entered.
+    """
+
+    model: Any  # a SkillGraphAgent: SB3 declares its own base class, which has no graph
+
+    def _on_training_start(self) -> None:
+        super()._on_training_start()
+        self._next_refresh = self.num_timesteps
+        self._describe()
+
+    def _on_step(self) -> bool:
+        if self.num_timesteps >= self._next_refresh:
+            self._next_refresh = self.num_timesteps + REFRESH_STEPS
+            self._describe()
+        return super()._on_step()
+
+    def _describe(self) -> None:
+        summary = self.model.graph_summary()
+        counts = "  ".join(f"{name} {summary[name]}" for name in ("events", "options", "edges"))
+        # The description is the only text that tqdm's rich bar shows; it has no postfix.
+        self.pbar.set_description(f"{counts}  coverage {summary['coverage']:.2f}", refresh=False)
+
+    def _on_training_end(self) -> None:
+        self._describe()
+        super()._on_training_end()
+
+    def close(self) -> None:
+        """Give the terminal back when learning was interrupted: SB3 then does not end its callbacks."""
+        if hasattr(self, "pbar"):
+            self.pbar.close()

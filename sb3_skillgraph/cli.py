@@ -1,0 +1,361 @@
+"""The command line: ``sb3-skillgraph train | evaluate | plot | demo``."""
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, NoReturn
+
+import gymnasium as gym
+import numpy as np
+import torch as th
+import yaml
+from rich.console import Console
+from rich.table import Table
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.logger import configure
+
+import sb3_skillgraph.envs  # noqa: F401 - registers the environments
+from sb3_skillgraph.agent import SkillGraphAgent
+from sb3_skillgraph.baselines import RandomWalk
+from sb3_skillgraph.callbacks import SkillGraphProgressBarCallback
+from sb3_skillgraph.evaluation import PairsResult, evaluate_pairs
+from sb3_skillgraph.hyperparams import check_hyperparams, did_you_mean, load_hyperparams
+from sb3_skillgraph.plotting import plot_plan, plot_skill_graph, run_plan, save_figure
+
+DEMO_ENV, DEMO_STEPS, DEMO_PAIRS = "SkillGraph/PointMazeMedium-v0", 100_000, 100
+USER_ERROR, INTERRUPTED = 2, 130
+_VERSIONS_OF = ("sb3_skillgraph", "stable_baselines3", "torch", "gymnasium", "gymnasium_robotics", "mujoco", "numpy")
+
+
+class UserError(Exception):
+    """Something the user can put right; shown as one line, without a traceback."""
+
+
+class _Parser(argparse.ArgumentParser):
+    """Says in one line what is wrong with the arguments."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(USER_ERROR, f"{self.prog}: error: {message} (see {self.prog} --help)\n")
+
+
+# -- arguments ------------------------------------------------------------------------------------------------------------
+
+
+def _positive(text: str) -> int:
+    number = int(text.replace("_", ""))
+    if number < 1:
+        raise argparse.ArgumentTypeError(f"must be at least 1, not {number}")
+    return number
+
+
+def _assignment(text: str) -> tuple[str, Any]:
+    name, equals, value = text.partition("=")
+    if not (name and equals):
+        raise argparse.ArgumentTypeError(f"{text!r} is not of the form NAME=VALUE")
+    try:
+        return name, yaml.safe_load(value)
+    except yaml.YAMLError as error:
+        raise argparse.ArgumentTypeError(f"the value of {name} is no valid YAML: {value!r}") from error
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """Build the parser of the whole command line.
+
+    :return: the parser; the chosen command is the attribute ``run`` of what it parses
+    """
+    parser = _Parser(
+        prog="sb3-skillgraph",
+        description="Deep Skill Graphs: learn skills without reward, plan over them to goals never trained on.",
+    )
+    parser.add_argument("--version", action="version", version=version("sb3_skillgraph"))
+    commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
+    _add_train(commands)
+    _add_evaluate(commands)
+    _add_plot(commands)
+    _add_demo(commands)
+    return parser
+
+
+def _add_command(commands: Any, name: str, run: Any, summary: str, detail: str) -> argparse.ArgumentParser:
+    command: argparse.ArgumentParser = commands.add_parser(
+        name, help=summary, description=f"{summary}\n\n{detail}", formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    command.set_defaults(run=run)
+    command.add_argument("--seed", type=int, default=0, help="seed of everything random (default: 0)")
+    return command
+
+
+def _add_env_kwargs(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "--env-kwargs",
+        nargs="+",
+        type=_assignment,
+        default=[],
+        metavar="NAME=VALUE",
+        help="arguments of the environment, values in YAML: maze_map=[[1,1,1],[1,0,1],[1,1,1]]",
+    )
+
+
+def _add_train(commands: Any) -> None:
+    command = _add_command(
+        commands,
+        "train",
+        _train,
+        "Train an agent on a goal environment, without reward.",
+        "Arguments of the agent come from its signature, then from the environment's entry in hyperparams/*.yml, then\n"
+        "from --hyperparams. OUT receives agent.zip, progress.csv and config.json. Ctrl-C saves the agent and stops.\n\n"
+        "example:\n  sb3-skillgraph train SkillGraph/PointMazeUMaze-v0 --steps 50000 --out runs/umaze\n"
+        "  sb3-skillgraph train SkillGraph/ToyMaze-v0 --hyperparams salience=rrt policy_kwargs='{net_arch: [64, 64]}'",
+    )
+    command.add_argument("env", metavar="ENV", help="environment id; 'package:Name-v0' imports the package first")
+    command.add_argument("--steps", type=_positive, help="environment steps (default: the environment's entry)")
+    command.add_argument("--out", type=Path, help="folder for the results (default: runs/<environment>-seed<seed>)")
+    command.add_argument("--n-envs", type=_positive, default=1, help="copies of the environment (default: 1)")
+    command.add_argument("--device", default="auto", help="torch device: auto, cpu, cuda (default: auto)")
+    command.add_argument("--verbose", action="store_true", help="print SB3's table as well as the progress bar")
+    command.add_argument(
+        "--hyperparams",
+        nargs="+",
+        type=_assignment,
+        default=[],
+        metavar="NAME=VALUE",
+        help="arguments of SkillGraphAgent, values in YAML",
+    )
+    _add_env_kwargs(command)
+
+
+def _add_evaluate(commands: Any) -> None:
+    command = _add_command(
+        commands,
+        "evaluate",
+        _evaluate,
+        "Measure how often a trained agent gets from a random start to a random goal of a maze.",
+        "With --adapt, a copy of the agent first learns for so many steps with each goal (few-shot).\n\n"
+        "example:\n  sb3-skillgraph evaluate runs/umaze/agent.zip --env SkillGraph/PointMazeUMaze-v0 --pairs 100",
+    )
+    command.add_argument("agent", type=Path, metavar="AGENT.zip", help="what train saved")
+    command.add_argument("--env", required=True, metavar="ENV", help="environment id")
+    command.add_argument("--pairs", type=_positive, default=100, help="pairs of start and goal (default: 100)")
+    command.add_argument("--adapt", type=_positive, default=0, metavar="STEPS", help="steps of adaptation per pair")
+    command.add_argument("--no-planning", action="store_true", help="walk straight to goals by the global option")
+    command.add_argument("--out", type=Path, metavar="FILE.json", help="write every pair to this file")
+    _add_env_kwargs(command)
+
+
+def _add_plot(commands: Any) -> None:
+    command = _add_command(
+        commands,
+        "plot",
+        _plot,
+        "Draw an agent's skill graph, and one plan as it is executed.",
+        "OUT receives skill_graph.png and plan.png; --seed chooses start and goal of the plan.\n\n"
+        "example:\n  sb3-skillgraph plot runs/umaze/agent.zip --env SkillGraph/PointMazeUMaze-v0 --out runs/umaze",
+    )
+    command.add_argument("agent", type=Path, metavar="AGENT.zip", help="what train saved")
+    command.add_argument("--env", required=True, metavar="ENV", help="environment id")
+    command.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the pictures")
+    _add_env_kwargs(command)
+
+
+def _add_demo(commands: Any) -> None:
+    command = _add_command(
+        commands,
+        "demo",
+        _demo,
+        f"Train on {DEMO_ENV}, evaluate random pairs of start and goal, and draw pictures.",
+        "The table compares the agent, the same agent with planning off, and a random walk. OUT receives agent.zip,\n"
+        "progress.csv, config.json, results.json, skill_graph.png and plan.png. A few minutes on two cores.\n\n"
+        "example:\n  sb3-skillgraph demo --out runs/demo",
+    )
+    command.add_argument("--steps", type=_positive, default=DEMO_STEPS, help=f"environment steps (default: {DEMO_STEPS})")
+    command.add_argument(
+        "--pairs", type=_positive, default=DEMO_PAIRS, help=f"pairs of start and goal (default: {DEMO_PAIRS})"
+    )
+    command.add_argument("--out", type=Path, default=Path("runs/demo"), help="folder for the results (default: runs/demo)")
+
+
+# -- commands -------------------------------------------------------------------------------------------------------------
+
+
+def _train(args: argparse.Namespace) -> int:
+    _check_env_id(args.env)
+    out = args.out or Path("runs") / f"{args.env.rpartition('/')[2]}-seed{args.seed}"
+    if (out / "agent.zip").exists():
+        raise UserError(f"{out} holds an agent already; give another folder with --out, or remove it.")
+    given = check_hyperparams(dict(args.hyperparams), "--hyperparams")
+    hyperparams = {**load_hyperparams(args.env), **given}
+    steps = args.steps or int(hyperparams["n_timesteps"])
+    env_kwargs = dict(args.env_kwargs)
+    _learn(args.env, env_kwargs, hyperparams, steps, args.seed, out, args.n_envs, args.device, args.verbose)
+    return 0
+
+
+def _learn(
+    env_id: str,
+    env_kwargs: dict[str, Any],
+    hyperparams: dict[str, Any],
+    steps: int,
+    seed: int,
+    out: Path,
+    n_envs: int = 1,
+    device: str = "auto",
+    verbose: bool = False,
+) -> SkillGraphAgent:
+    """Train, and leave agent, log and configuration in a folder; Ctrl-C saves what there is and is raised again."""
+    arguments = {name: value for name, value in hyperparams.items() if name != "n_timesteps"}
+    env = make_vec_env(env_id, n_envs=n_envs, env_kwargs=env_kwargs)
+    try:
+        agent = SkillGraphAgent(env=env, seed=seed, **{"device": device, **arguments})
+        out.mkdir(parents=True, exist_ok=True)
+        config = dict(env=env_id, env_kwargs=env_kwargs, steps=steps, seed=seed, n_envs=n_envs, arguments=arguments)
+        _write_json(out / "config.json", {**config, "versions": {name: version(name) for name in _VERSIONS_OF}})
+        agent.set_logger(configure(str(out), ["csv", "stdout"] if verbose else ["csv"]))
+        bar = SkillGraphProgressBarCallback()
+        try:
+            agent.learn(steps, callback=bar)
+        finally:
+            bar.close()
+            agent.logger.close()
+            agent.save(out / "agent.zip")
+            print(f"{agent.num_timesteps} steps; the agent is in {out / 'agent.zip'}, its log in {out / 'progress.csv'}")
+        return agent
+    finally:
+        env.close()
+
+
+def _evaluate(args: argparse.Namespace) -> int:
+    env_kwargs = dict(args.env_kwargs)
+    env = _make_env(args.env, env_kwargs)
+    try:
+        agent = SkillGraphAgent.load(args.agent, env=env)
+        agent.planning = not args.no_planning
+        result = evaluate_pairs(
+            agent, args.env, env_kwargs=env_kwargs, n_pairs=args.pairs, seed=args.seed, adapt_timesteps=args.adapt
+        )
+    finally:
+        env.close()
+    _print_table(args.env, {str(args.agent): result})
+    if args.out is not None:
+        _write_json(args.out, _as_plain(result))
+        print(f"every pair is in {args.out}")
+    return 0
+
+
+def _plot(args: argparse.Namespace) -> int:
+    env = _make_env(args.env, dict(args.env_kwargs))
+    try:
+        agent = SkillGraphAgent.load(args.agent, env=env)
+        env.reset(seed=args.seed)
+        _draw(agent, env, args.out)
+    finally:
+        env.close()
+    return 0
+
+
+def _demo(args: argparse.Namespace) -> int:
+    print(f"Learning {DEMO_ENV} for {args.steps} steps without reward; then {args.pairs} random pairs of start and goal.")
+    agent = _learn(DEMO_ENV, {}, load_hyperparams(DEMO_ENV), args.steps, args.seed, args.out)
+    results = {}
+    for name, planning in (("skill graph", True), ("same agent, planning off", False)):
+        agent.planning = planning
+        results[name] = evaluate_pairs(agent, DEMO_ENV, n_pairs=args.pairs, seed=args.seed)
+    agent.planning = True
+    assert isinstance(agent.action_space, gym.spaces.Box)
+    walk = RandomWalk(agent.action_space, args.seed)
+    results["random walk"] = evaluate_pairs(walk, DEMO_ENV, n_pairs=args.pairs, seed=args.seed)
+    _print_table(DEMO_ENV, results)
+    _write_json(args.out / "results.json", {name: _as_plain(result) for name, result in results.items()})
+    # The longest way that succeeded shows the most; failing all, the longest.
+    shown = max(results["skill graph"].pairs, key=lambda pair: (pair.success, pair.path_length))
+    env = _make_env(DEMO_ENV, {})
+    try:
+        _draw(agent, env, args.out, shown.start, shown.goal)
+    finally:
+        env.close()
+    print(f"everything is in {args.out}")
+    return 0
+
+
+# -- what the commands share ----------------------------------------------------------------------------------------------
+
+
+def _check_env_id(env_id: str) -> None:
+    """Find an environment by its id, importing the package named before a colon."""
+    try:
+        gym.spec(env_id)
+    except (gym.error.Error, ImportError) as error:
+        known = [id for id in gym.registry if id.rpartition("/")[0] or "Maze" in id]
+        short = {id.rpartition("/")[2]: id for id in known}
+        hint = did_you_mean(env_id, known) or did_you_mean(env_id.rpartition("/")[2], short)
+        reason = f": {error}" if isinstance(error, ImportError) else ""
+        raise UserError(f"there is no environment {env_id!r}{reason}{hint}.") from error
+
+
+def _make_env(env_id: str, env_kwargs: dict[str, Any]) -> gym.Env:
+    _check_env_id(env_id)
+    return gym.make(env_id, **env_kwargs)
+
+
+def _draw(
+    agent: SkillGraphAgent, env: gym.Env, out: Path, start: np.ndarray | None = None, goal: np.ndarray | None = None
+) -> None:
+    geometry = env.get_wrapper_attr("geometry") if env.has_wrapper_attr("geometry") else None
+    save_figure(plot_skill_graph(agent, geometry), out / "skill_graph.png")
+    trajectory, plan = run_plan(agent, env, start, goal)
+    save_figure(plot_plan(agent, geometry, trajectory, plan), out / "plan.png")
+    print(f"the pictures are {out / 'skill_graph.png'} and {out / 'plan.png'}")
+
+
+def _mean_steps(result: PairsResult) -> float | None:
+    steps = [pair.steps for pair in result.pairs if pair.success]
+    return float(np.mean(steps)) if steps else None
+
+
+def _print_table(title: str, results: dict[str, PairsResult]) -> None:
+    n_pairs = len(next(iter(results.values())).pairs)
+    table = Table(title=f"{title}: {n_pairs} random pairs of start and goal")
+    table.add_column("")
+    for column in ("goals reached", "95 % interval", "mean steps where reached"):
+        table.add_column(column, justify="right")
+    for name, result in results.items():
+        low, high = result.interval
+        steps = _mean_steps(result)
+        table.add_row(name, f"{result.success_rate:.0%}", f"{low:.0%} to {high:.0%}", "-" if steps is None else f"{steps:.0f}")
+    Console().print(table)
+
+
+def _as_plain(result: PairsResult) -> dict[str, Any]:
+    return {
+        "success_rate": result.success_rate,
+        "interval": result.interval,
+        "mean_steps": _mean_steps(result),
+        "pairs": [{**pair._asdict(), "start": pair.start.tolist(), "goal": pair.goal.tolist()} for pair in result.pairs],
+    }
+
+
+def _write_json(path: Path, document: dict[str, Any]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    # Classes, such as option_class, by their names.
+    path.write_text(json.dumps(document, indent=2, default=lambda item: getattr(item, "__name__", str(item))) + "\n")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """
+    Run a command.
+
+    :param argv: arguments; None for those of the process
+    :return: exit code: 0, 2 for something the user can put right, 130 after Ctrl-C
+    """
+    args = build_parser().parse_args(argv)
+    th.set_num_threads(1)  # networks this small are faster so, and other cores are free for other runs
+    try:
+        return int(args.run(args))
+    except KeyboardInterrupt:
+        print("sb3-skillgraph: interrupted", file=sys.stderr)
+        return INTERRUPTED
+    except (UserError, ValueError, TypeError, OSError, gym.error.Error) as error:
+        print(f"sb3-skillgraph: error: {' '.join(str(error).split())}", file=sys.stderr)
+        return USER_ERROR

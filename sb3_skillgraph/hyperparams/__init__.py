@@ -1,0 +1,76 @@
+"""Hyperparameters per environment, read from YAML beside this file (the layout of SB3's zoo)."""
+
+import difflib
+import inspect
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import yaml
+from stable_baselines3 import DDPG, SAC, TD3
+
+from sb3_skillgraph.agent import SkillGraphAgent
+from sb3_skillgraph.options.learner import OptionDDPG, OptionTD3
+
+FILE = Path(__file__).parent / "skillgraph.yml"
+
+_OPTION_CLASSES: dict[str, Any] = {cls.__name__: cls for cls in (OptionDDPG, OptionTD3, DDPG, TD3, SAC)}
+# `n_timesteps` is for learn(); the others of these are given by who makes the agent.
+_KNOWN = ({"n_timesteps"} | set(inspect.signature(SkillGraphAgent.__init__).parameters)) - {
+    "self",
+    "env",
+    "seed",
+    "_init_setup_model",
+}
+
+
+def load_hyperparams(env_id: str, path: Path = FILE) -> dict[str, Any]:
+    """Read what is recommended for an environment.
+
+    :param env_id: id of the environment; one without an entry gets the file's ``defaults``
+    :param path: YAML file
+    :return: ``n_timesteps`` and keyword arguments of :class:`~sb3_skillgraph.SkillGraphAgent`, ``policy`` among them
+    :raises ValueError: if the file is no YAML of that layout, or names an unknown argument or option class
+    """
+    try:
+        document = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
+    except yaml.YAMLError as error:
+        raise ValueError(f"{path.name} is no valid YAML: {' '.join(str(error).split())}") from error
+    hyperparams: dict[str, Any] = {}
+    for entry in ("defaults", env_id):
+        values = (document.get(entry) or {}) if isinstance(document, dict) else document
+        if not isinstance(values, dict):
+            raise ValueError(f"{path.name}, entry {entry!r}: a mapping of argument names to values is wanted.")
+        hyperparams.update(check_hyperparams(values, f"{path.name}, entry {entry!r}"))
+    return hyperparams
+
+
+def check_hyperparams(values: dict[str, Any], origin: str) -> dict[str, Any]:
+    """Check the names of hyperparameters, and put option classes in place of their names.
+
+    :param values: hyperparameters as YAML gives them
+    :param origin: where they come from, for the messages
+    :return: hyperparameters as :class:`~sb3_skillgraph.SkillGraphAgent` takes them
+    :raises ValueError: if an argument or an option class is unknown
+    """
+    for name in values:
+        if name not in _KNOWN:
+            raise ValueError(f"{origin}: unknown argument {name!r}{did_you_mean(str(name), _KNOWN)}.")
+    checked = dict(values)
+    if "option_class" in checked:
+        name = checked["option_class"]
+        if name not in _OPTION_CLASSES:
+            raise ValueError(f"{origin}: unknown option_class {name!r}; it is one of {', '.join(_OPTION_CLASSES)}.")
+        checked["option_class"] = _OPTION_CLASSES[name]
+    return checked
+
+
+def did_you_mean(name: str, names: Iterable[str]) -> str:
+    """Suggest the names nearest to a mistyped one.
+
+    :param name: the name given
+    :param names: the names that exist
+    :return: ``"; did you mean 'x' or 'y'?"`` without the question mark, or an empty string
+    """
+    close = difflib.get_close_matches(name, sorted(names), n=3)
+    return f"; did you mean {' or '.join(map(repr, close))}" if close else ""

@@ -1,0 +1,200 @@
+"""Learning that is broken off, saved, and taken up in another process ends exactly where unbroken learning ends."""
+
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from conftest import (
+    POINT,
+    TOY,
+    Recorder,
+    check_store,
+    differences,
+    in_new_process,
+    new_agent,
+    new_vec_env,
+    state_in,
+    state_of,
+    without_clock,
+)
+from stable_baselines3 import SAC, TD3
+from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise
+from stable_baselines3.common.vec_env import SubprocVecEnv
+
+from sb3_skillgraph import PAPER, SkillGraphAgent
+
+GO_ON = """
+import sys
+from conftest import new_vec_env
+from sb3_skillgraph import SkillGraphAgent
+
+folder, env_id, n_envs, n_steps, max_steps = sys.argv[1], sys.argv[2], *map(int, sys.argv[3:])
+env = new_vec_env(env_id, n_envs, max_steps=max_steps)
+agent = SkillGraphAgent.load(folder + "/half.zip", env=env)
+agent.load_replay_buffer(folder + "/half_replay.zip")
+agent.learn(n_steps, reset_num_timesteps=False)
+agent.save(folder + "/whole.zip")
+agent.save_replay_buffer(folder + "/whole_replay.zip")
+"""
+
+
+def go_on(agent: SkillGraphAgent, n_steps: int, folder: Path, env: Any) -> SkillGraphAgent:
+    """Save, load, and learn on, in this process."""
+    agent.save(folder / "half.zip")
+    agent.save_replay_buffer(folder / "half_replay.zip")
+    resumed = SkillGraphAgent.load(folder / "half.zip", env=env)
+    resumed.load_replay_buffer(folder / "half_replay.zip")
+    return resumed.learn(n_steps, reset_num_timesteps=False)
+
+
+def check_equal(a: dict[str, Any], b: dict[str, Any]) -> None:
+    assert differences(without_clock(a), without_clock(b)) == []
+
+
+def check_new_process(folder: Path, env_id: str, n_envs: int, n_steps: int, max_steps: int) -> SkillGraphAgent:
+    env_kwargs = dict(env_id=env_id, n_envs=n_envs, max_steps=max_steps)
+    straight = new_agent(new_vec_env(**env_kwargs)).learn(2 * n_steps)
+    half = new_agent(new_vec_env(**env_kwargs)).learn(n_steps)
+    half.save(folder / "half.zip")
+    half.save_replay_buffer(folder / "half_replay.zip")
+    in_new_process(GO_ON, folder, env_id, n_envs, n_steps, max_steps)
+    check_equal(state_of(straight), state_in(folder / "whole.zip", folder / "whole_replay.zip"))
+    return straight
+
+
+@pytest.mark.parametrize(("n_envs", "n_steps"), [(1, 777), (2, 701)])
+def test_new_process_ends_where_unbroken_learning_ends(tmp_path: Path, n_envs: int, n_steps: int) -> None:
+    agent = check_new_process(tmp_path, TOY, n_envs, n_steps, max_steps=100)
+    # It was put to the test with something to lose: mature options, and chains there and back.
+    assert sum(option.mature for option in agent.options) >= 3
+    chains = {(chain.source, chain.target) for chain in agent.chaining.chains.values()}
+    assert any((target, source) in chains for source, target in chains)
+
+
+@pytest.mark.mujoco
+@pytest.mark.parametrize("n_envs", [1, 2])
+def test_new_process_on_a_simulator(tmp_path: Path, n_envs: int) -> None:
+    agent = check_new_process(tmp_path, POINT, n_envs, 601, max_steps=150)
+    assert agent.options
+
+
+@pytest.mark.parametrize("n_steps", [1, 150, 263, 300])
+def test_any_number_of_steps(tmp_path: Path, n_steps: int) -> None:
+    # Before learning starts, with an option in gestation, and at the end of an episode.
+    straight = new_agent(gym.make(TOY)).learn(2 * n_steps)
+    half = new_agent(gym.make(TOY)).learn(n_steps)
+    check_equal(state_of(straight), state_of(go_on(half, n_steps, tmp_path, gym.make(TOY))))
+
+
+def test_in_the_middle_of_gestation(tmp_path: Path) -> None:
+    half = new_agent(gestation_period=3).learn(413)
+    assert any(0 < option.n_successes and not option.mature for option in half.options)
+    straight = new_agent(gestation_period=3).learn(826)
+    check_equal(state_of(straight), state_of(go_on(half, 413, tmp_path, gym.make(TOY))))
+
+
+@pytest.mark.parametrize(
+    "kwargs",
+    [
+        dict(train_freq=4, gradient_steps=2),
+        dict(option_class=TD3),
+        dict(option_class=SAC),
+        dict({k: v for k, v in PAPER.items() if k not in ("batch_size", "policy_kwargs")}, salient_event_freq=2),
+    ],
+    ids=["train_freq", "TD3", "SAC", "PAPER"],
+)
+def test_with_other_arguments(tmp_path: Path, kwargs: dict[str, Any]) -> None:
+    straight = new_agent(gym.make(TOY), **kwargs).learn(902)
+    half = new_agent(gym.make(TOY), **kwargs).learn(451)
+    check_equal(state_of(straight), state_of(go_on(half, 451, tmp_path, gym.make(TOY))))
+
+
+@pytest.mark.parametrize("n_envs", [1, 2])
+def test_noise_with_a_memory_of_its_own(tmp_path: Path, n_envs: int) -> None:
+    def agent() -> SkillGraphAgent:
+        noise = OrnsteinUhlenbeckActionNoise(np.zeros(2), 0.3 * np.ones(2))
+        return new_agent(new_vec_env(n_envs=n_envs), action_noise=noise)
+
+    straight, half = agent().learn(502), agent().learn(251)
+    check_equal(state_of(straight), state_of(go_on(half, 251, tmp_path, new_vec_env(n_envs=n_envs))))
+
+
+def test_environments_in_other_processes(tmp_path: Path) -> None:
+    straight = new_agent(new_vec_env()).learn(602)
+    half = new_agent(new_vec_env()).learn(301)
+    env = new_vec_env(vec_env_cls=SubprocVecEnv)
+    try:
+        check_equal(state_of(straight), state_of(go_on(half, 301, tmp_path, env)))
+    finally:
+        env.close()
+
+
+def test_environment_given_later(tmp_path: Path) -> None:
+    straight = new_agent().learn(602)
+    half = new_agent().learn(301)
+    half.save(tmp_path / "half")
+    half.save_replay_buffer(tmp_path / "half_replay")
+    resumed = SkillGraphAgent.load(tmp_path / "half")
+    resumed.load_replay_buffer(tmp_path / "half_replay")
+    resumed.set_env(gym.make(TOY))
+    check_equal(state_of(straight), state_of(resumed.learn(301, reset_num_timesteps=False)))
+
+
+def test_in_three_parts_without_files() -> None:
+    straight, parts = new_agent().learn(900), new_agent().learn(300)
+    for _ in range(2):
+        parts.learn(300, reset_num_timesteps=False)
+    check_equal(state_of(straight), state_of(parts))
+
+
+def test_saving_a_loaded_agent_again_changes_nothing(trained_files: tuple[Path, Path]) -> None:
+    agent = SkillGraphAgent.load(trained_files[0], env=gym.make(TOY))
+    agent.load_replay_buffer(trained_files[1])
+    assert differences(state_in(*trained_files), state_of(agent)) == []
+
+
+def test_force_reset_begins_an_episode(trained_files: tuple[Path, Path]) -> None:
+    env = Recorder(gym.make(TOY))
+    agent = SkillGraphAgent.load(trained_files[0], env=env, force_reset=True)
+    agent.learn(50, reset_num_timesteps=False)
+    assert len(env.starts) == 1
+    np.testing.assert_array_equal(env.transitions[0]["achieved_goal"], env.starts[0])
+
+
+def test_starting_over_forgets_where_the_saved_environment_stood(trained_files: tuple[Path, Path]) -> None:
+    env = Recorder(gym.make(TOY, max_steps=1000))
+    agent = SkillGraphAgent.load(trained_files[0], env=env)
+    agent.learn(150, log_interval=None)
+    agent.learn(150, log_interval=None, reset_num_timesteps=False)
+    # One episode of 300 steps: the second call goes on where the first stopped.
+    assert len(env.starts) == 1
+    check_store(agent, env.transitions)
+
+
+@pytest.mark.parametrize("n_envs", [1, 3])
+def test_other_number_of_environments(trained_files: tuple[Path, Path], n_envs: int) -> None:
+    agent = SkillGraphAgent.load(trained_files[0], env=new_vec_env(n_envs=n_envs))
+    total = agent.num_timesteps
+    agent.learn(300, reset_num_timesteps=False)
+    assert agent.num_timesteps == total + 300
+    assert agent.store.total == 300
+
+
+def test_environment_that_cannot_tell_its_state(tmp_path: Path) -> None:
+    class Closed(gym.Wrapper):
+        def get_wrapper_attr(self, name: str) -> Any:
+            if name in ("get_state", "set_state"):
+                raise AttributeError(name)
+            return super().get_wrapper_attr(name)
+
+        def has_wrapper_attr(self, name: str) -> bool:
+            return name not in ("get_state", "set_state") and super().has_wrapper_attr(name)
+
+    half = new_agent(Closed(gym.make(TOY))).learn(250)
+    env = Recorder(Closed(gym.make(TOY)))
+    resumed = go_on(half, 250, tmp_path, env)
+    assert resumed.num_timesteps == resumed.store.total == 500
+    assert len(env.transitions) == 250
+    np.testing.assert_array_equal(env.transitions[0]["achieved_goal"], env.starts[0])
