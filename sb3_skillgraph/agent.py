@@ -78,7 +78,7 @@ class SkillGraphAgent(Assembly):
     :param replay_buffer_kwargs: refused
     :param optimize_memory_usage: refused
     :param n_steps: refused unless 1
-    :param policy_kwargs: keyword arguments of every option's policy, ``net_arch`` for instance
+    :param policy_kwargs: keyword arguments of every option's policy; ``net_arch`` is ``[128, 128]`` unless given
     :param stats_window_size: episodes over which SB3's rollout statistics are averaged
     :param tensorboard_log: folder of the TensorBoard log
     :param verbose: 0 for silence, 1 for the progress table
@@ -138,7 +138,7 @@ class SkillGraphAgent(Assembly):
         learning_rate: float | Schedule = 1e-3,
         buffer_size: int = 1_000_000,
         learning_starts: int = 1_000,
-        batch_size: int = 256,
+        batch_size: int = 128,
         tau: float = 0.005,
         gamma: float = 0.98,
         train_freq: int | tuple[int, str] = 1,
@@ -218,6 +218,7 @@ class SkillGraphAgent(Assembly):
         self._exploration_noise = exploration_noise
         self._random_action_prob = random_action_prob
         self._random_hold = random_hold
+        self._reset_options: dict[str, Any] = {}  # while adapting: where episodes start
         if env is not None:
             self._spec = GoalSpec.of(self.observation_space, self.action_space)
         if self.env is not None and unwrap_vec_normalize(self.env) is not None:
@@ -334,6 +335,8 @@ class SkillGraphAgent(Assembly):
         """Store the step once, and let everything learn from it."""
         assert isinstance(new_obs, dict)
         reached = _with_terminal(new_obs, dones, infos)
+        if self._reset_options:
+            new_obs = self._start_over(new_obs, dones)
         check_finite(new_obs, self.num_timesteps)
         if reached is not new_obs:
             check_finite(reached, self.num_timesteps)
@@ -343,6 +346,16 @@ class SkillGraphAgent(Assembly):
             self._last_original_obs = new_obs
             self._pending = None
             self._assign_missions()
+
+    def _start_over(self, new_obs: dict[str, np.ndarray], dones: np.ndarray) -> dict[str, np.ndarray]:
+        """Reset environments once more where they are to start: the VecEnv's own resets know no options."""
+        assert self.env is not None
+        new_obs = {key: np.array(value) for key, value in new_obs.items()}
+        for i in np.flatnonzero(dones).tolist():
+            observation, _ = self.env.env_method("reset", options=self._reset_options, indices=i)[0]
+            for key in new_obs:
+                new_obs[key][i] = observation[key]
+        return new_obs
 
     def _learn_from_step(self, reached: dict[str, np.ndarray], dones: np.ndarray, infos: list[dict[str, Any]]) -> None:
         step = self._pending
@@ -524,16 +537,14 @@ class SkillGraphAgent(Assembly):
         """
         target = self._checked_goal(goal)
         assert self.env is not None, "Give the agent an environment (set_env) before adapt."
-        options: dict[str, Any] = {} if start is None else {"start": self._checked_goal(start)}
-        self._last_obs = None
+        self._reset_options = {} if start is None else {"start": self._checked_goal(start)}
+        self._last_obs, self._env_snapshot = None, None
         try:
-            for _ in range(self.n_envs):
-                self.env.set_options(options)
+            self.env.set_options(self._reset_options)
             self.curriculum.pin(target)
             return self.learn(total_timesteps, callback, log_interval=None, reset_num_timesteps=False)
         finally:
-            self.curriculum.pinned = None
-            self.env.set_options()
+            self.curriculum.pinned, self._reset_options, self._last_obs = None, {}, None
 
 
 class _Pending(NamedTuple):

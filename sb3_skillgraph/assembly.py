@@ -24,6 +24,9 @@ from sb3_skillgraph.salience.proposals import FrontierSalience, RandomSalience, 
 from sb3_skillgraph.visited import VisitedStates
 
 
+NET_ARCH = [128, 128]  # of every network: each option has a small job
+
+
 class Assembly(Persistence):
     """Builds the parts of a :class:`~sb3_skillgraph.SkillGraphAgent` from its arguments; it is part of it."""
 
@@ -81,7 +84,9 @@ class Assembly(Persistence):
 
     def _option_kwargs(self) -> dict[str, Any]:
         option_class: type[OffPolicyAlgorithm] = self._arguments["option_class"]
-        kwargs: dict[str, Any] = dict(gamma=self.gamma, tau=self.tau, policy_kwargs=self.policy_kwargs)
+        kwargs: dict[str, Any] = dict(
+            gamma=self.gamma, tau=self.tau, policy_kwargs={"net_arch": NET_ARCH, **self.policy_kwargs}
+        )
         if issubclass(option_class, OptionLearner):
             if callable(self.learning_rate):
                 raise ValueError(

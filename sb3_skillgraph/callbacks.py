@@ -2,7 +2,9 @@
 
 from typing import Any
 
+from rich.progress import BarColumn, TimeElapsedColumn, TimeRemainingColumn
 from stable_baselines3.common.callbacks import ProgressBarCallback
+from tqdm.rich import tqdm
 
 #: Environment steps between two looks at the graph.
 REFRESH_STEPS = 500
@@ -17,7 +19,10 @@ class SkillGraphProgressBarCallback(ProgressBarCallback):
     model: Any  # a SkillGraphAgent: SB3 declares its own base class, which has no graph
 
     def _on_training_start(self) -> None:
-        super()._on_training_start()
+        # Fewer columns than tqdm's own, so that everything fits on a line of 80 characters.
+        columns = ("{task.percentage:>3.0f}%", BarColumn(None), TimeElapsedColumn(), "<", TimeRemainingColumn())
+        total = self.locals["total_timesteps"] - self.model.num_timesteps
+        self.pbar = tqdm(total=total, progress=("{task.description}", *columns))
         self._next_refresh = self.num_timesteps
         self._describe()
 

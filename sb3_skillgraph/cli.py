@@ -3,7 +3,8 @@
 import argparse
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NoReturn
@@ -41,7 +42,7 @@ class _Parser(argparse.ArgumentParser):
         self.exit(USER_ERROR, f"{self.prog}: error: {message} (see {self.prog} --help)\n")
 
 
-# -- arguments ------------------------------------------------------------------------------------------------------------
+# -- arguments ---------------------------------------------------------------------------------------------------------
 
 
 def _positive(text: str) -> int:
@@ -106,7 +107,7 @@ def _add_train(commands: Any) -> None:
         _train,
         "Train an agent on a goal environment, without reward.",
         "Arguments of the agent come from its signature, then from the environment's entry in hyperparams/*.yml, then\n"
-        "from --hyperparams. OUT receives agent.zip, progress.csv and config.json. Ctrl-C saves the agent and stops.\n\n"
+        "from --hyperparams. OUT receives agent.zip, progress.csv and config.json. Ctrl-C saves the agent, too.\n\n"
         "example:\n  sb3-skillgraph train SkillGraph/PointMazeUMaze-v0 --steps 50000 --out runs/umaze\n"
         "  sb3-skillgraph train SkillGraph/ToyMaze-v0 --hyperparams salience=rrt policy_kwargs='{net_arch: [64, 64]}'",
     )
@@ -177,7 +178,7 @@ def _add_demo(commands: Any) -> None:
     command.add_argument("--out", type=Path, default=Path("runs/demo"), help="folder for the results (default: runs/demo)")
 
 
-# -- commands -------------------------------------------------------------------------------------------------------------
+# -- commands ----------------------------------------------------------------------------------------------------------
 
 
 def _train(args: argparse.Namespace) -> int:
@@ -185,8 +186,9 @@ def _train(args: argparse.Namespace) -> int:
     out = args.out or Path("runs") / f"{args.env.rpartition('/')[2]}-seed{args.seed}"
     if (out / "agent.zip").exists():
         raise UserError(f"{out} holds an agent already; give another folder with --out, or remove it.")
-    given = check_hyperparams(dict(args.hyperparams), "--hyperparams")
-    hyperparams = {**load_hyperparams(args.env), **given}
+    with _for_people():
+        given = check_hyperparams(dict(args.hyperparams), "--hyperparams")
+        hyperparams = {**load_hyperparams(args.env), **given}
     steps = args.steps or int(hyperparams["n_timesteps"])
     env_kwargs = dict(args.env_kwargs)
     _learn(args.env, env_kwargs, hyperparams, steps, args.seed, out, args.n_envs, args.device, args.verbose)
@@ -206,9 +208,11 @@ def _learn(
 ) -> SkillGraphAgent:
     """Train, and leave agent, log and configuration in a folder; Ctrl-C saves what there is and is raised again."""
     arguments = {name: value for name, value in hyperparams.items() if name != "n_timesteps"}
-    env = make_vec_env(env_id, n_envs=n_envs, env_kwargs=env_kwargs)
+    with _for_people():
+        env = make_vec_env(env_id, n_envs=n_envs, env_kwargs=env_kwargs)
     try:
-        agent = SkillGraphAgent(env=env, seed=seed, **{"device": device, **arguments})
+        with _for_people():
+            agent = SkillGraphAgent(env=env, seed=seed, **{"device": device, **arguments})
         out.mkdir(parents=True, exist_ok=True)
         config = dict(env=env_id, env_kwargs=env_kwargs, steps=steps, seed=seed, n_envs=n_envs, arguments=arguments)
         _write_json(out / "config.json", {**config, "versions": {name: version(name) for name in _VERSIONS_OF}})
@@ -230,7 +234,9 @@ def _evaluate(args: argparse.Namespace) -> int:
     env_kwargs = dict(args.env_kwargs)
     env = _make_env(args.env, env_kwargs)
     try:
-        agent = SkillGraphAgent.load(args.agent, env=env)
+        if not env.has_wrapper_attr("geometry"):
+            raise UserError(f"evaluate draws its pairs from the walls of a maze, and {args.env!r} is none.")
+        agent = _load(args.agent, env)
         agent.planning = not args.no_planning
         result = evaluate_pairs(
             agent, args.env, env_kwargs=env_kwargs, n_pairs=args.pairs, seed=args.seed, adapt_timesteps=args.adapt
@@ -247,7 +253,7 @@ def _evaluate(args: argparse.Namespace) -> int:
 def _plot(args: argparse.Namespace) -> int:
     env = _make_env(args.env, dict(args.env_kwargs))
     try:
-        agent = SkillGraphAgent.load(args.agent, env=env)
+        agent = _load(args.agent, env)
         env.reset(seed=args.seed)
         _draw(agent, env, args.out)
     finally:
@@ -259,7 +265,7 @@ def _demo(args: argparse.Namespace) -> int:
     print(f"Learning {DEMO_ENV} for {args.steps} steps without reward; then {args.pairs} random pairs of start and goal.")
     agent = _learn(DEMO_ENV, {}, load_hyperparams(DEMO_ENV), args.steps, args.seed, args.out)
     results = {}
-    for name, planning in (("skill graph", True), ("same agent, planning off", False)):
+    for name, planning in (("skill graph", True), ("planning off", False)):
         agent.planning = planning
         results[name] = evaluate_pairs(agent, DEMO_ENV, n_pairs=args.pairs, seed=args.seed)
     agent.planning = True
@@ -279,7 +285,7 @@ def _demo(args: argparse.Namespace) -> int:
     return 0
 
 
-# -- what the commands share ----------------------------------------------------------------------------------------------
+# -- what the commands share -------------------------------------------------------------------------------------------
 
 
 def _check_env_id(env_id: str) -> None:
@@ -296,7 +302,22 @@ def _check_env_id(env_id: str) -> None:
 
 def _make_env(env_id: str, env_kwargs: dict[str, Any]) -> gym.Env:
     _check_env_id(env_id)
-    return gym.make(env_id, **env_kwargs)
+    with _for_people():
+        return gym.make(env_id, **env_kwargs)
+
+
+def _load(path: Path, env: gym.Env) -> SkillGraphAgent:
+    with _for_people():
+        return SkillGraphAgent.load(path, env=env)
+
+
+@contextmanager
+def _for_people() -> Iterator[None]:
+    """Say in one line what the library refuses; for the steps that check what the user gave, and for no others."""
+    try:
+        yield
+    except (ValueError, TypeError, RuntimeError, gym.error.Error) as error:
+        raise UserError(str(error)) from error
 
 
 def _draw(
@@ -318,7 +339,7 @@ def _print_table(title: str, results: dict[str, PairsResult]) -> None:
     n_pairs = len(next(iter(results.values())).pairs)
     table = Table(title=f"{title}: {n_pairs} random pairs of start and goal")
     table.add_column("")
-    for column in ("goals reached", "95 % interval", "mean steps where reached"):
+    for column in ("goals reached", "95 % interval", "mean steps there"):
         table.add_column(column, justify="right")
     for name, result in results.items():
         low, high = result.interval
@@ -356,6 +377,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("sb3-skillgraph: interrupted", file=sys.stderr)
         return INTERRUPTED
-    except (UserError, ValueError, TypeError, OSError, gym.error.Error) as error:
+    except (UserError, OSError) as error:
         print(f"sb3-skillgraph: error: {' '.join(str(error).split())}", file=sys.stderr)
         return USER_ERROR

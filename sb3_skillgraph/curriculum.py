@@ -15,6 +15,7 @@ from sb3_skillgraph.salience.discovery import EventDiscovery
 from sb3_skillgraph.visited import VisitedStates
 
 N_EXPLORED = 10  # candidates for an exploration
+JOINED_ALREADY = 3.0  # option runs the agent walks further to practise a chain to an event that is not joined yet
 
 
 class Strategy(NamedTuple):
@@ -297,17 +298,17 @@ class Curriculum:
         return self._to_event(point, events[self.rng.integers(len(events))])
 
     def _nearest_chain(self, point: np.ndarray) -> SkillChain | None:
-        """Return the open chain whose source is cheapest to reach (ties: the one practised least)."""
+        """Return the open chain that is cheapest to practise from here; those to events not joined yet come first."""
+        connected = self.connected()
 
         def cost(chain: SkillChain) -> tuple[float, int]:
             source = self.graph.events[chain.source]
-            if source.contains(point[None])[0]:
-                return 0.0, chain.n_failures
-            path = self.planner.path_to(point, chain.source)
-            return (float("inf") if path is None else path.cost), chain.n_failures
+            path = None if source.contains(point[None])[0] else self.planner.path_to(point, chain.source)
+            travel = 0.0 if source.contains(point[None])[0] else float("inf") if path is None else path.cost
+            return travel + JOINED_ALREADY * (chain.target in connected), chain.n_failures
 
-        here = self.graph.events
-        chains = [c for c in self.chaining.open_chains() if not here[c.target].contains(point[None])[0]]
+        events = self.graph.events
+        chains = [c for c in self.chaining.open_chains() if not events[c.target].contains(point[None])[0]]
         return min(chains, key=cost, default=None)
 
     def _explore(self) -> Mission:

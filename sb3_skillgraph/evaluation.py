@@ -1,6 +1,5 @@
 """From anywhere to anywhere: the success rate over random pairs of start and goal (section 4.2)."""
 
-import copy
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
@@ -124,17 +123,16 @@ def evaluate_pairs(
         env.reset(seed=seed)
         results = []
         for start, goal, cells in drawn:
-            tested = _adapted(agent, start, goal, adapt_timesteps) if adapt_timesteps else agent
+            tested: Any = agent
+            if adapt_timesteps:
+                tested = tested.copy(gym.make(env_id, **(env_kwargs or {})))
+                tested.adapt(goal, start=start, total_timesteps=adapt_timesteps)
             results.append(_run_pair(tested, env, start, goal, cells))
+            if tested is not agent:
+                tested.get_env().close()
         return PairsResult(results)
     finally:
         env.close()
-
-
-def _adapted(agent: Any, start: np.ndarray, goal: np.ndarray, total_timesteps: int) -> Any:
-    adapted = copy.deepcopy(agent)
-    adapted.adapt(goal, start=start, total_timesteps=total_timesteps)
-    return adapted
 
 
 def _run_pair(agent: Predictor, env: gym.Env, start: np.ndarray, goal: np.ndarray, cells: float) -> PairResult:

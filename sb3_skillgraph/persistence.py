@@ -1,5 +1,6 @@
 """Saving and loading an agent: SB3's signatures, plain data only (nothing is ever unpickled)."""
 
+import io
 import random
 from collections import deque
 from collections.abc import Iterable
@@ -228,6 +229,22 @@ class Persistence(OffPolicyAlgorithm):
             agent.env, agent.n_envs = wrapped, wrapped.num_envs
         agent._setup_model()
         agent._restore(tree, same_envs=agent.n_envs == tree["n_envs"] and not force_reset)
+        return agent
+
+    def copy(self: SelfPersistence, env: GymEnv) -> SelfPersistence:
+        """
+        Copy the agent, replay buffer included; what the copy learns leaves this one as it is.
+
+        :param env: environment of the copy
+        :return: the copy
+        """
+        agent_file, replay_file = io.BytesIO(), io.BytesIO()
+        self.save(agent_file)
+        self.save_replay_buffer(replay_file)
+        # What is stored by name only is given again.
+        named = {name: value for name, value in self._arguments.items() if callable(value) or hasattr(value, "propose")}
+        agent = type(self).load(agent_file, env=env, device=self.device, **named)
+        agent.load_replay_buffer(replay_file)
         return agent
 
     def _restore(self, tree: dict[str, Any], same_envs: bool) -> None:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from hypothesis import HealthCheck, settings
+from hypothesis import HealthCheck, Phase, settings
 
 from sb3_skillgraph.chaining import DeepSkillChaining
 from sb3_skillgraph.controller import Controller
@@ -32,13 +32,18 @@ PAPER_GRAPH: dict[str, Any] = {
 }
 
 
-def profile(max_examples: int) -> settings:
-    """Hypothesis settings that find the same examples on every machine."""
+def profile(max_examples: int, *, shrink: bool = True) -> settings:
+    """Hypothesis settings that find the same examples on every machine.
+
+    :param max_examples: number of examples
+    :param shrink: whether to look for the smallest failing example, which for long histories takes minutes
+    """
     return settings(
         max_examples=max_examples,
         deadline=None,
         derandomize=True,
         database=None,
+        phases=[Phase.explicit, Phase.generate, *([Phase.shrink] if shrink else [])],
         suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large, HealthCheck.filter_too_much],
     )
 

@@ -1,5 +1,6 @@
 """What several test modules share: small agents on the NumPy maze, environments that misbehave, comparing states."""
 
+import copy
 import io
 import os
 import subprocess
@@ -25,16 +26,18 @@ th.set_num_threads(1)
 TOY, POINT = "SkillGraph/ToyMaze-v0", "SkillGraph/PointMazeUMaze-v0"
 #: Small networks and batches: a thousand steps take a second.
 SMALL: dict[str, Any] = dict(policy_kwargs=dict(net_arch=[16, 16]), batch_size=32, learning_starts=200, seed=0)
-#: Options mature at their first success, so that a few hundred steps give chains in both directions.
-EAGER: dict[str, Any] = dict(SMALL, gestation_period=1)
+#: Options mature at their first success and events lie close together, so that a few hundred steps give a graph worth
+#: the name, with chains in both directions.
+EAGER: dict[str, Any] = dict(SMALL, gestation_period=1, event_reach=10)
 
 
 def new_agent(env: gym.Env | VecEnv | str = TOY, **kwargs: Any) -> SkillGraphAgent:
-    return SkillGraphAgent("MultiInputPolicy", env, **{**EAGER, **kwargs})
+    return SkillGraphAgent("MultiInputPolicy", env, **copy.deepcopy({**EAGER, **kwargs}))
 
 
 def new_vec_env(env_id: str = TOY, n_envs: int = 2, vec_env_cls: type[VecEnv] = DummyVecEnv, **kwargs: Any) -> VecEnv:
-    return make_vec_env(env_id, n_envs=n_envs, seed=0, vec_env_cls=vec_env_cls, env_kwargs=kwargs)
+    # The module is named for the sake of worker processes, which must import it to know the environment.
+    return make_vec_env(f"sb3_skillgraph:{env_id}", n_envs=n_envs, seed=0, vec_env_cls=vec_env_cls, env_kwargs=kwargs)
 
 
 class Recorder(gym.Wrapper):
@@ -133,7 +136,7 @@ def differences(a: Any, b: Any, where: str = "") -> list[str]:
 
 
 def state_of(agent: SkillGraphAgent) -> dict[str, Any]:
-    """All that an agent would save, with its replay buffer."""
+    """All that an agent would save, with its replay buffer; the generators that SB3 shares among all agents included."""
     files = io.BytesIO(), io.BytesIO()
     agent.save(files[0])
     agent.save_replay_buffer(files[1])
@@ -160,6 +163,8 @@ def check_store(agent: SkillGraphAgent, transitions: list[dict[str, np.ndarray]]
     store = agent.store
     rows = np.arange(store.oldest, store.total)[env :: agent.n_envs]
     assert len(rows) == len(transitions)
+    if not transitions:
+        return
     for name in ("observation", "achieved_goal", "next_observation", "next_achieved_goal"):
         expected = np.array([step[name] for step in transitions], dtype=np.float32)
         np.testing.assert_array_equal(store.column(name, rows), expected, err_msg=name)
@@ -170,7 +175,8 @@ def check_store(agent: SkillGraphAgent, transitions: list[dict[str, np.ndarray]]
 
 def in_new_process(code: str, *arguments: object, hash_seed: int = 1) -> None:
     """Run a program that can import this module; fails with what it printed."""
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parent), "PYTHONHASHSEED": str(hash_seed)}
+    search = os.pathsep.join([str(Path(__file__).parent), *sys.path])
+    environment = {**os.environ, "PYTHONPATH": search, "PYTHONHASHSEED": str(hash_seed)}
     command = [sys.executable, "-c", code, *map(str, arguments)]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 0, done.stdout + done.stderr

@@ -13,11 +13,11 @@ ROOT = Path(sb3_skillgraph.__file__).parent
 
 #: Module or package -> floor. A package's modules live on the floor of the package unless named themselves.
 FLOORS: dict[str, float] = {
+    "version": -1,  # a constant
     "replay": 0,
     "events": 0,
     "visited": 0,
     "saving": 0,
-    "version": 0,
     "interrupts": 0,
     "envs": 0,
     "options": 1,
@@ -27,9 +27,10 @@ FLOORS: dict[str, float] = {
     "salience": 3,
     "planner": 3,
     "controller": 4,
-    "curriculum": 4,
     "smdp": 4,
-    "persistence": 4.5,
+    "curriculum": 4.2,  # turns the controller's outcomes into knowledge
+    "persistence": 4.5,  # these two are the agent's lower storeys
+    "assembly": 4.7,
     "agent": 5,
     "evaluation": 6,
     "callbacks": 6,

@@ -16,12 +16,8 @@ FILE = Path(__file__).parent / "skillgraph.yml"
 
 _OPTION_CLASSES: dict[str, Any] = {cls.__name__: cls for cls in (OptionDDPG, OptionTD3, DDPG, TD3, SAC)}
 # `n_timesteps` is for learn(); the others of these are given by who makes the agent.
-_KNOWN = ({"n_timesteps"} | set(inspect.signature(SkillGraphAgent.__init__).parameters)) - {
-    "self",
-    "env",
-    "seed",
-    "_init_setup_model",
-}
+_PARAMETERS = inspect.signature(SkillGraphAgent.__init__).parameters
+_KNOWN = ({"n_timesteps"} | set(_PARAMETERS)) - {"self", "env", "seed", "_init_setup_model"}
 
 
 def load_hyperparams(env_id: str, path: Path = FILE) -> dict[str, Any]:
@@ -46,23 +42,37 @@ def load_hyperparams(env_id: str, path: Path = FILE) -> dict[str, Any]:
 
 
 def check_hyperparams(values: dict[str, Any], origin: str) -> dict[str, Any]:
-    """Check the names of hyperparameters, and put option classes in place of their names.
+    """Check names and numbers of hyperparameters, and put option classes in place of their names.
 
     :param values: hyperparameters as YAML gives them
     :param origin: where they come from, for the messages
     :return: hyperparameters as :class:`~sb3_skillgraph.SkillGraphAgent` takes them
-    :raises ValueError: if an argument or an option class is unknown
+    :raises ValueError: if an argument or an option class is unknown, or no number is given where one is wanted
     """
     for name in values:
         if name not in _KNOWN:
             raise ValueError(f"{origin}: unknown argument {name!r}{did_you_mean(str(name), _KNOWN)}.")
-    checked = dict(values)
+    checked = {name: _number(name, value, origin) for name, value in values.items()}
     if "option_class" in checked:
         name = checked["option_class"]
         if name not in _OPTION_CLASSES:
             raise ValueError(f"{origin}: unknown option_class {name!r}; it is one of {', '.join(_OPTION_CLASSES)}.")
         checked["option_class"] = _OPTION_CLASSES[name]
     return checked
+
+
+def _number(name: str, value: Any, origin: str) -> Any:
+    """Return a value as the number its argument wants; YAML takes ``1e-3``, without a dot, for a string."""
+    parameter = _PARAMETERS.get(name)
+    default = parameter.default if parameter is not None else 0  # n_timesteps
+    optional = parameter is not None and "None" in str(parameter.annotation)
+    if type(default) not in (int, float) or (optional and value is None):
+        return value
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        raise ValueError(f"{origin}: {name} must be a number, not {value!r}.") from None
+    return int(number) if number.is_integer() and isinstance(default, int) else number
 
 
 def did_you_mean(name: str, names: Iterable[str]) -> str:

@@ -12,15 +12,15 @@ from matplotlib.patches import Circle, Rectangle
 from sb3_skillgraph.envs import MazeGeometry
 
 # Colours that remain apart for the colour-blind; every figure means the same thing by them.
-WALL, REGION, VISITED, EFFECT, EVENT = "#4a4a4a", "#9ecae1", "#969696", "#e6550d", "#111111"
+WALL, REGION, VISITED, EFFECT, EVENT = "#757575", "#9ecae1", "#969696", "#e6550d", "#111111"
 
 #: Drawing order, from the floor up.
 Z_REGION, Z_VISITED, Z_WALL, Z_EFFECT, Z_LINK, Z_EVENT, Z_LABEL = range(1, 8)
 
 
 def new_axes() -> Axes:
-    """Make a figure of its own with one pair of axes, room for a legend beside it."""
-    figure = Figure(figsize=(9.5, 7.0), layout="constrained")
+    """Make a figure of its own with one pair of axes, and room for a legend."""
+    figure = Figure(figsize=(8.5, 7.5), layout="constrained")
     return figure.add_subplot()
 
 

@@ -1,6 +1,7 @@
 """One plan as it was executed: which option took the agent where (section 3.3)."""
 
-from typing import NamedTuple
+import itertools
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -39,7 +40,7 @@ def run_plan(
     Plan, and execute one episode, until the goal is reached or the episode ends.
 
     :param agent: the agent
-    :param env: a goal environment; start and goal need one whose ``reset`` takes ``options={"start": ..., "goal": ...}``
+    :param env: a goal environment; start and goal need one whose ``reset`` takes them as ``options``
     :param start: where to start, shape ``(goal_dim,)``; None for the environment's own start
     :param goal: where to go, shape ``(goal_dim,)``; None for the environment's own goal
     :return: what happened, and the plan made at the start
@@ -95,7 +96,8 @@ def plot_plan(
 
 def _describe(plan: Plan) -> str:
     case = {"in_graph": "in the graph", "in_initiation_set": "in an initiation set", "outside": "outside the graph"}
-    way = " > ".join(plan.path) if plan.path else "straight to the goal"
+    straight = "straight to the goal" if np.isfinite(plan.cost) else "none, no path leads there yet"
+    way = " > ".join(plan.path) or straight
     return f"goal {case[plan.status]}; plan: {way}"
 
 
@@ -122,9 +124,10 @@ def _draw_runs(axes: Axes, agent: SkillGraphAgent, trajectory: Trajectory) -> No
     points = figures.project(trajectory.points)
     changes = np.flatnonzero(np.diff(trajectory.options)) + 1
     bounds = [0, *changes.tolist(), len(trajectory.options)]
+    style: dict[str, Any]
     colors: dict[int, tuple[float, float, float]] = {}
     shown = set()
-    for begin, end in zip(bounds[:-1], bounds[1:], strict=True):
+    for begin, end in itertools.pairwise(bounds):
         if begin == end:
             continue
         index = int(trajectory.options[begin])

@@ -27,11 +27,13 @@ class EventLink(NamedTuple):
     :param source: id of the event it leaves
     :param target: id of the event it leads to
     :param success_probability: product of the edges' success rates
+    :param cost: sum of the edges' weights, in option runs
     """
 
     source: str
     target: str
     success_probability: float
+    cost: float
 
 
 def event_links(graph: SkillGraph) -> list[EventLink]:
@@ -43,19 +45,42 @@ def event_links(graph: SkillGraph) -> list[EventLink]:
     links = []
     for source in graph.events:
         ways = nx.subgraph_view(graph.nx, filter_edge=lambda u, v, source=source: u == source or u not in graph.events)
-        paths = nx.single_source_dijkstra_path(ways, source, weight="weight")
+        costs, paths = nx.single_source_dijkstra(ways, source, weight="weight")
         links += [
-            EventLink(source, target, graph.success_probability(path))
+            EventLink(source, target, graph.success_probability(path), costs[target])
             for target, path in paths.items()
             if target in graph.events and target != source
         ]
     return links
 
 
+def near_links(links: list[EventLink]) -> list[EventLink]:
+    """
+    Leave out the links that shorter ones explain.
+
+    A link goes if some third event is nearer to both its ends than they are to each other, as in a relative
+    neighbourhood graph; what could be reached over links still can.
+
+    :param links: all links
+    :return: those that remain, in the same order
+    """
+    costs = {(link.source, link.target): link.cost for link in links}
+    events = {link.source for link in links}
+
+    def explained(link: EventLink) -> bool:
+        return any(
+            max(costs.get((link.source, event), np.inf), costs.get((event, link.target), np.inf)) < link.cost
+            for event in events
+        )
+
+    return [link for link in links if not explained(link)]
+
+
 def plot_skill_graph(agent: SkillGraphAgent, geometry: MazeGeometry | None = None, ax: Axes | None = None) -> Axes:
     """
     Draw what an agent has discovered: events, how they are joined, and where its options start and end.
 
+    An arrow joins two events that options alone lead between, unless shorter arrows explain it (:func:`near_links`).
     Goal spaces of more than two dimensions are drawn by their first two; initiation sets then show as the visited
     states inside them.
 
@@ -72,11 +97,11 @@ def plot_skill_graph(agent: SkillGraphAgent, geometry: MazeGeometry | None = Non
     _draw_visited(axes, agent)
     _draw_regions(axes, agent)
     _draw_effects(axes, agent)
-    links = event_links(agent.graph)
+    links = near_links(event_links(agent.graph))
     _draw_links(axes, agent, links)
     _draw_events(axes, agent)
     n_options = len(agent.graph.options)
-    axes.set_title(f"Skill graph: {len(events)} salient events, {n_options} options, {len(links)} event-to-event links")
+    axes.set_title(f"Skill graph: {len(events)} salient events, {n_options} options, {len(links)} links between events")
     _draw_key(axes)
     return axes
 
@@ -171,12 +196,13 @@ def _draw_events(axes: Axes, agent: SkillGraphAgent) -> None:
 
 
 def _draw_key(axes: Axes) -> None:
-    dots = dict(color="none", marker="o", markersize=8)
     handles = [
         Line2D(
             [],
             [],
-            **dots,
+            color="none",
+            marker="o",
+            markersize=8,
             markerfacecolor="white",
             markeredgecolor=figures.EVENT,
             label="salient event (circle: its region)",
@@ -184,6 +210,6 @@ def _draw_key(axes: Axes) -> None:
         Line2D([], [], color=_LINKS(0.9), linewidth=1.5, marker=">", markersize=4, label="options lead from event to event"),
         Patch(facecolor=figures.REGION, label="an option can start here (darker: several)"),
         Line2D([], [], color="none", marker="x", markersize=5, markeredgecolor=figures.EFFECT, label="an option ended here"),
-        Line2D([], [], color="none", marker=".", markeredgecolor=figures.VISITED, label="visited state"),
+        Line2D([], [], color="none", marker=".", markersize=4, markeredgecolor=figures.VISITED, label="visited state"),
     ]
     axes.legend(handles=handles, loc="upper center", bbox_to_anchor=(0.5, -0.09), ncols=2, fontsize=8, frameon=False)

@@ -1,0 +1,528 @@
+"""Bad input gets one clear error and loses nothing."""
+
+import io
+import os
+import pickle
+import resource
+import signal
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from conftest import (
+    TOY,
+    Faulty,
+    Recorder,
+    check_store,
+    differences,
+    interrupt,
+    new_agent,
+    new_vec_env,
+    put,
+    state_in,
+    state_of,
+)
+from gymnasium import spaces
+from stable_baselines3 import DDPG
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+from sb3_skillgraph import OptionEnv, SkillGraphAgent
+from sb3_skillgraph.events import SalientEvent
+from sb3_skillgraph.saving import SCHEMA
+
+
+class Spaces(gym.Env):
+    """An environment that has spaces and nothing else."""
+
+    success_radius = 0.5
+
+    def __init__(self, action: spaces.Space | None = None, **entries: spaces.Space | None) -> None:
+        point = spaces.Box(-1.0, 1.0, (2,))
+        given = {"observation": point, "achieved_goal": point, "desired_goal": point, **entries}
+        self.observation_space = spaces.Dict({key: space for key, space in given.items() if space is not None})
+        self.action_space = action or spaces.Box(-1.0, 1.0, (2,))
+
+
+class Hidden(gym.Wrapper):
+    """Hides attributes of an environment."""
+
+    def __init__(self, env: gym.Env, *hidden: str) -> None:
+        super().__init__(env)
+        self.hidden = hidden
+
+    def get_wrapper_attr(self, name: str) -> Any:
+        if name in self.hidden:
+            raise AttributeError(name)
+        return super().get_wrapper_attr(name)
+
+    def has_wrapper_attr(self, name: str) -> bool:
+        return name not in self.hidden and super().has_wrapper_attr(name)
+
+
+# -- construction -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("env", "message"),
+    [
+        (lambda: gym.make("Pendulum-v1"), "goal environment"),
+        (lambda: Spaces(desired_goal=None), "desired_goal"),
+        (lambda: Spaces(observation=spaces.Discrete(3)), "Box"),
+        (lambda: Spaces(observation=spaces.Dict(x=spaces.Box(-1, 1))), ".*"),
+        (lambda: Spaces(desired_goal=spaces.Box(-1.0, 1.0, (3,))), "same length"),
+        (lambda: Spaces(action=spaces.Discrete(4)), "continuous actions"),
+        (lambda: Spaces(action=spaces.MultiBinary(2)), "continuous actions"),
+        (lambda: Spaces(action=spaces.Box(-np.inf, np.inf, (2,))), "finite"),
+    ],
+    ids=["flat", "no goal", "discrete", "nested", "lengths", "Discrete", "MultiBinary", "unbounded"],
+)
+def test_environment_that_does_not_fit(env: Callable[[], gym.Env], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        SkillGraphAgent("MultiInputPolicy", env())
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        dict(replay_buffer_class=ReplayBuffer),
+        dict(replay_buffer_kwargs=dict(n_sampled_goal=4)),
+        dict(optimize_memory_usage=True),
+        dict(n_steps=3),
+        dict(use_sde=True),
+        dict(salience="curiosity"),
+        dict(salience=None),
+        dict(option_view="sideways"),
+        dict(event_radius=0.0),
+        dict(event_radius=-1.0),
+        dict(event_radius=float("nan")),
+        dict(learning_rate=lambda progress: 1e-3 * progress),
+    ],
+    ids=lambda arguments: next(iter(arguments)),
+)
+def test_refused_arguments(arguments: dict[str, Any]) -> None:
+    name = next(iter(arguments))
+    with pytest.raises(ValueError, match=name.replace("_", ".")):
+        new_agent(**arguments)
+
+
+def test_policy_of_another_kind() -> None:
+    with pytest.raises(ValueError, match="MlpPolicy"):
+        SkillGraphAgent("MlpPolicy", gym.make(TOY))
+
+
+def test_unknown_salience_names_the_known() -> None:
+    with pytest.raises(ValueError, match=r"'curiosity'.*'frontier', 'rrt'"):
+        new_agent(salience="curiosity")
+
+
+def test_rrt_without_an_oracle() -> None:
+    with pytest.raises(ValueError, match=r"sample_free.*frontier"):
+        new_agent(Hidden(gym.make(TOY), "sample_free"), salience="rrt")
+
+
+def test_event_radius_that_cannot_be_known() -> None:
+    env = Hidden(gym.make(TOY), "success_radius", "distance_threshold")
+    with pytest.raises(ValueError, match="event_radius"):
+        new_agent(env)
+    assert new_agent(env, event_radius=0.3).event_radius == 0.3
+
+
+def test_vec_normalize(trained_files: tuple[Path, Path]) -> None:
+    def normalized() -> VecNormalize:
+        return VecNormalize(DummyVecEnv([lambda: gym.make(TOY)]), norm_obs_keys=["observation"])
+
+    with pytest.raises(ValueError, match="VecNormalize"):
+        new_agent(normalized())
+    with pytest.raises(ValueError, match="VecNormalize"):
+        new_agent().set_env(normalized())
+    with pytest.raises(ValueError, match="VecNormalize"):
+        SkillGraphAgent.load(trained_files[0], env=normalized())
+
+
+def test_environment_of_another_shape(trained_files: tuple[Path, Path]) -> None:
+    with pytest.raises(ValueError, match="spaces do not match"):
+        SkillGraphAgent.load(trained_files[0], env=Spaces())
+    with pytest.raises(ValueError, match="spaces do not match"):
+        new_agent().set_env(Spaces())
+
+
+def test_option_env_needs_a_goal_environment() -> None:
+    event = SalientEvent("e", np.zeros(2), 0.5)
+    with pytest.raises(ValueError, match="goal environment"):
+        OptionEnv(gym.make("Pendulum-v1"), event)
+    with pytest.raises(ValueError, match="shape"):
+        OptionEnv(gym.make(TOY), event, goal=np.zeros(3))
+
+
+@pytest.mark.parametrize("where", ["start", "goal"])
+@pytest.mark.parametrize("value", [[0.0, 0.0], [9.0, 0.0], [1.0], [1.0, 1.0, 1.0], [np.nan, 1.0], "here"])
+def test_start_or_goal_that_is_no_place(where: str, value: Any) -> None:
+    env = gym.make(TOY)
+    env.reset()
+    with pytest.raises(ValueError, match=f"'{where}'.*free space"):
+        env.reset(options={where: value})
+
+
+# -- predict ----------------------------------------------------------------------------------------------------------
+
+
+def test_predict_before_there_is_any_option() -> None:
+    agent = new_agent()
+    obs, _ = agent.env.envs[0].reset()
+    action, _ = agent.predict(obs)
+    assert agent.action_space.contains(action)
+    actions = [agent.predict({**obs, "desired_goal": np.array(goal)})[0] for goal in ([1.0, 1.0], [-1.0, -1.0])]
+    assert not np.array_equal(*actions)  # the goal matters
+
+
+@pytest.mark.parametrize(
+    ("obs", "message"),
+    [
+        (np.zeros(2), "Dict observation"),
+        ({"observation": np.zeros(2), "achieved_goal": np.zeros(2)}, "Dict observation"),
+        ({"observation": np.zeros(3), "achieved_goal": np.zeros(2), "desired_goal": np.zeros(2)}, "'observation'"),
+        ({"observation": np.zeros(2), "achieved_goal": np.zeros(2), "desired_goal": np.zeros((1, 2))}, "'desired_goal'"),
+        ({"observation": np.zeros((1, 2)), "achieved_goal": np.zeros((1, 2)), "desired_goal": np.zeros(2)}, "'desired_g"),
+    ],
+)
+def test_observation_of_the_wrong_kind(obs: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        new_agent().predict(obs)
+
+
+# -- observations that are no numbers ---------------------------------------------------------------------------------
+
+
+def check_goes_on(agent: SkillGraphAgent, recorders: list[Recorder], reset_num_timesteps: bool) -> None:
+    """After trouble, an agent can be saved, loaded, and can learn on, and its memory holds what truly happened."""
+    agent.save(file := io.BytesIO())
+    agent.save_replay_buffer(replay_file := io.BytesIO())
+    loaded = SkillGraphAgent.load(file, env=new_vec_env(n_envs=agent.n_envs))
+    loaded.load_replay_buffer(replay_file)
+    for each in (loaded, agent):
+        total, n_steps = each.store.total, each.num_timesteps * (not reset_num_timesteps)
+        each.learn(120, reset_num_timesteps=reset_num_timesteps)
+        assert each.store.total - total == each.num_timesteps - n_steps == 120
+        for name, column in each.store.get_state()["columns"].items():
+            assert np.isfinite(column).all(), name
+        assert np.isfinite(np.concatenate([p.detach().ravel() for p in each.policy.parameters()])).all()
+    for i, recorder in enumerate(recorders):
+        check_store(agent, recorder.transitions, i)
+
+
+def faulty_envs(n_envs: int, at: int, fault: Callable, **kwargs: Any) -> tuple[DummyVecEnv, list[Recorder]]:
+    """Environments of which the last is faulty; what recorders see is what goes on behind the fault."""
+    recorders = [Recorder(gym.make(TOY, max_steps=60)) for _ in range(n_envs)]
+    envs: list[gym.Env] = [*recorders]
+    envs[-1] = Faulty(recorders[-1], at, fault, **kwargs)
+    return DummyVecEnv([lambda env=env: env for env in envs]), recorders
+
+
+@pytest.mark.filterwarnings("ignore:overflow")
+@pytest.mark.parametrize("n_envs", [1, 2])
+@pytest.mark.parametrize("reset_num_timesteps", [True, False])
+@pytest.mark.parametrize(
+    ("key", "value", "at"), [("observation", np.nan, 25), ("achieved_goal", np.inf, 60), ("desired_goal", 1e300, 120)]
+)
+def test_no_number_in_a_step(key: str, value: float, at: int, n_envs: int, reset_num_timesteps: bool) -> None:
+    # Steps 60 and 120 end episodes: there it is the terminal observation.
+    env, recorders = faulty_envs(n_envs, at, put(key, value))
+    agent = new_agent(env)
+    with pytest.raises(ValueError, match=f"'{key}' of environment {n_envs - 1} .* step {at * n_envs}"):
+        agent.learn(300)
+    assert agent.store.total == (at - 1) * n_envs
+    for recorder in recorders:
+        del recorder.transitions[-1]  # the step that was refused
+    check_goes_on(agent, recorders, reset_num_timesteps)
+
+
+@pytest.mark.parametrize("reset_num_timesteps", [True, False])
+@pytest.mark.parametrize("n_envs", [1, 2])
+def test_no_number_at_the_first_reset(n_envs: int, reset_num_timesteps: bool) -> None:
+    env, recorders = faulty_envs(n_envs, 1, put("observation", np.nan), on_reset=True)
+    agent = new_agent(env)
+    with pytest.raises(ValueError, match=f"'observation' of environment {n_envs - 1} .* step 0"):
+        agent.learn(300)
+    assert agent.store.total == 0
+    check_goes_on(agent, recorders, reset_num_timesteps)
+
+
+def test_no_number_at_a_later_reset() -> None:
+    env, recorders = faulty_envs(1, 2, put("achieved_goal", -np.inf), on_reset=True)
+    agent = new_agent(env)
+    with pytest.raises(ValueError, match=r"'achieved_goal' of environment 0 .* step 60"):
+        agent.learn(300)
+    del recorders[0].transitions[-1]
+    check_goes_on(agent, recorders, False)
+
+
+# -- damaged and foreign files ----------------------------------------------------------------------------------------
+
+
+class Bomb:
+    """Leaves a trace when it is unpickled."""
+
+    def __init__(self, trace: Path) -> None:
+        self.trace = trace
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return os.mkdir, (str(self.trace),)
+
+
+def with_member(path: Path, name: str, content: bytes) -> bytes:
+    """A saved file with one member replaced or added."""
+    file = io.BytesIO()
+    with zipfile.ZipFile(path) as old, zipfile.ZipFile(file, "w") as new:
+        for member in old.namelist():
+            if member != name:
+                new.writestr(member, old.read(member))
+        new.writestr(name, content)
+    return file.getvalue()
+
+
+def as_npy(array: np.ndarray) -> bytes:
+    file = io.BytesIO()
+    np.save(file, array, allow_pickle=True)
+    return file.getvalue()
+
+
+def refused(agent: SkillGraphAgent, content: bytes, folder: Path, match: str = "Cannot load") -> None:
+    """No way of loading takes the file, as a path of any ending or as an object; and the agent stays as it was."""
+    path = folder / "bad.zip"
+    path.write_bytes(content)
+    (folder / "bad.pkl").write_bytes(content)
+    before = state_of(agent)
+    for given in (path, str(folder / "bad.pkl"), io.BytesIO(content)):
+        for load in (SkillGraphAgent.load, agent.set_parameters, agent.load_replay_buffer):
+            with pytest.raises(ValueError, match=match):
+                load(given)
+    assert differences(before, state_of(agent)) == []
+
+
+@pytest.mark.parametrize("which", [0, 1], ids=["agent", "replay"])
+@pytest.mark.parametrize("part", [0.0, 0.001, 0.3, 0.9, 0.999])
+def test_truncated(
+    trained: SkillGraphAgent, trained_files: tuple[Path, Path], tmp_path: Path, which: int, part: float
+) -> None:
+    content = trained_files[which].read_bytes()
+    refused(trained, content[: int(part * len(content))], tmp_path)
+
+
+def test_flipped_bits(trained: SkillGraphAgent, trained_files: tuple[Path, Path]) -> None:
+    expected, before = state_in(*trained_files), state_of(trained)
+    rng = np.random.default_rng(0)
+    n_refused = 0
+    for which, load in ((0, SkillGraphAgent.load), (0, trained.set_parameters), (1, trained.load_replay_buffer)):
+        content = trained_files[which].read_bytes()
+        ends = [*range(0, 60, 7), *range(len(content) - 400, len(content), 29)]
+        for position in [*ends, *rng.integers(0, len(content), 8)]:
+            flipped = bytearray(content)
+            flipped[position] ^= 1 << int(rng.integers(8))
+            try:
+                loaded = load(io.BytesIO(flipped))
+            except ValueError:
+                n_refused += 1
+                continue
+            # A date or a flag of the zip: nothing that counts.
+            if loaded is not None:
+                assert differences(expected["agent"], state_of(loaded)["agent"]) == [], position
+        assert differences(before["replay"], state_of(trained)["replay"]) == []
+        assert differences(before["agent"]["parameters"], state_of(trained)["agent"]["parameters"]) == []
+    assert n_refused > 50
+
+
+def test_files_of_another_kind(trained: SkillGraphAgent, trained_files: tuple[Path, Path], tmp_path: Path) -> None:
+    DDPG("MlpPolicy", "Pendulum-v1", policy_kwargs=dict(net_arch=[4])).save(tmp_path / "ddpg.zip")
+    refused(trained, (tmp_path / "ddpg.zip").read_bytes(), tmp_path)
+    refused(trained, b"PK\x03\x04 and so on", tmp_path)
+    refused(trained, b"some text", tmp_path)
+    with pytest.raises(ValueError, match="'replay_buffer', not a 'agent'"):
+        SkillGraphAgent.load(trained_files[1])
+    with pytest.raises(ValueError, match="'replay_buffer', not a 'agent'"):
+        trained.set_parameters(trained_files[1])
+    with pytest.raises(ValueError, match="'agent', not a 'replay_buffer'"):
+        trained.load_replay_buffer(trained_files[0])
+
+
+def test_newer_schema(trained: SkillGraphAgent, trained_files: tuple[Path, Path], tmp_path: Path) -> None:
+    with zipfile.ZipFile(trained_files[0]) as archive:
+        document = archive.read("agent.json").replace(b'"schema": %d' % SCHEMA, b'"schema": %d' % (SCHEMA + 1))
+    refused(trained, with_member(trained_files[0], "agent.json", document), tmp_path, "newer than .* upgrade")
+
+
+def test_missing_file(trained: SkillGraphAgent, tmp_path: Path) -> None:
+    for load in (SkillGraphAgent.load, trained.set_parameters, trained.load_replay_buffer):
+        with pytest.raises(FileNotFoundError, match="nothing_here"):
+            load(tmp_path / "nothing_here")
+
+
+def test_pickles_are_never_run(trained: SkillGraphAgent, trained_files: tuple[Path, Path], tmp_path: Path) -> None:
+    trace = tmp_path / "trace"
+    bomb = pickle.dumps(Bomb(trace))
+    array = np.empty(1, dtype=object)
+    array[0] = Bomb(trace)
+    refused(trained, bomb, tmp_path)
+    refused(trained, as_npy(array), tmp_path)
+    for path in trained_files:
+        refused(trained, with_member(path, "agent.json", bomb), tmp_path)
+        refused(trained, with_member(path, "arrays/f4.npy", as_npy(array)), tmp_path)
+        refused(trained, with_member(path, "arrays/f4.npy", bomb), tmp_path)
+    for name in ("data", "policy.pth", "extra.pkl"):
+        SkillGraphAgent.load(io.BytesIO(with_member(trained_files[0], name, bomb)))
+    assert not trace.exists()
+    pickle.loads(bomb)
+    assert trace.exists()  # the bomb works
+
+
+# -- no room to save --------------------------------------------------------------------------------------------------
+
+
+def save_both(agent: SkillGraphAgent, folder: Path) -> None:
+    agent.save(folder / "agent.zip")
+    agent.save_replay_buffer(folder / "replay.zip")
+
+
+def files_in(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+def check_old_files_stay(agent: SkillGraphAgent, folder: Path, error: type[BaseException] = OSError) -> None:
+    before, state = files_in(folder), state_of(agent)
+    assert len(before) == 2
+    for save, name in ((agent.save, "agent.zip"), (agent.save_replay_buffer, "replay.zip")):
+        with pytest.raises(error):
+            save(folder / name)
+    assert files_in(folder) == before
+    assert differences(state, state_of(agent)) == []
+
+
+def test_old_file_stays_if_renaming_fails(
+    trained: SkillGraphAgent, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    save_both(trained, tmp_path)
+
+    def fail(*_: Any, **__: Any) -> None:
+        raise OSError("no")
+
+    monkeypatch.setattr(os, "replace", fail)
+    check_old_files_stay(trained, tmp_path)
+
+
+@pytest.mark.parametrize("limit", [0, 5000])
+def test_old_file_stays_if_the_disk_is_full(trained: SkillGraphAgent, tmp_path: Path, limit: int) -> None:
+    save_both(trained, tmp_path)
+    trained.learn(50, reset_num_timesteps=False)
+    before, limits = files_in(tmp_path), resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limits[1]))
+    try:
+        for save, name in ((trained.save, "agent.zip"), (trained.save_replay_buffer, "replay.zip")):
+            with pytest.raises(OSError, match="too large"):
+                save(tmp_path / name)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert files_in(tmp_path) == before
+    save_both(trained, tmp_path)
+    assert files_in(tmp_path) != before
+
+
+def test_old_file_stays_if_saving_is_interrupted(
+    trained: SkillGraphAgent, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    save_both(trained, tmp_path)
+
+    def fail(*_: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(os, "fsync", fail)
+    check_old_files_stay(trained, tmp_path, KeyboardInterrupt)
+
+
+def test_folder_that_cannot_be_made(trained: SkillGraphAgent, tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(OSError, match="file"):
+        trained.save(tmp_path / "file" / "agent.zip")
+
+
+# -- Ctrl-C -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("n_envs", [1, 2])
+@pytest.mark.parametrize("at", [1, 90, 120])
+def test_interrupt_in_an_environment(n_envs: int, at: int) -> None:
+    env, recorders = faulty_envs(n_envs, at, interrupt)
+    agent = new_agent(env)
+    with pytest.raises(KeyboardInterrupt):
+        agent.learn(300)
+    assert agent.store.total == agent.num_timesteps == (at - 1) * n_envs
+    for recorder in recorders:
+        del recorder.transitions[at - 1 :]
+    check_goes_on(agent, recorders, False)
+
+
+def test_interrupt_in_a_callback() -> None:
+    env = Recorder(gym.make(TOY))
+    agent = new_agent(env)
+
+    def callback(variables: dict[str, Any], _: dict[str, Any]) -> bool:
+        if agent.num_timesteps == 250:
+            raise KeyboardInterrupt
+        return True
+
+    with pytest.raises(KeyboardInterrupt):
+        agent.learn(300, callback=callback)
+    assert agent.store.total == 249
+    del env.transitions[-1]
+    check_goes_on(agent, [env], False)
+
+
+def test_interrupt_in_an_update(monkeypatch: pytest.MonkeyPatch) -> None:
+    env = Recorder(gym.make(TOY))
+    agent = new_agent(env)
+    replay, sample = agent.global_option.replay, agent.global_option.replay.sample
+
+    def interrupted(*arguments: Any, **kwargs: Any) -> Any:
+        if agent.num_timesteps == 260:
+            raise KeyboardInterrupt
+        return sample(*arguments, **kwargs)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(replay, "sample", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            agent.learn(400)
+    assert agent.store.total == agent.num_timesteps == 260
+    check_goes_on(agent, [env], False)
+
+
+@pytest.mark.parametrize("where", ["store.add", "visited.record", "curriculum.observe", "curriculum.assign"])
+def test_ctrl_c_while_a_step_is_being_stored(where: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    env = Recorder(gym.make(TOY, max_steps=60))
+    agent = new_agent(env, learning_starts=1000)  # updates are no part of storing
+    owner, name = getattr(agent, where.split(".")[0]), where.split(".")[1]
+    method = getattr(owner, name)
+
+    def pressed(*arguments: Any, **kwargs: Any) -> Any:
+        if agent.num_timesteps == 240:  # at the end of an episode
+            signal.raise_signal(signal.SIGINT)
+        return method(*arguments, **kwargs)
+
+    handler = signal.getsignal(signal.SIGINT)
+    with monkeypatch.context() as patch:
+        patch.setattr(owner, name, pressed)
+        with pytest.raises(KeyboardInterrupt):
+            agent.learn(300)
+    assert signal.getsignal(signal.SIGINT) is handler
+    assert agent.store.total == agent.num_timesteps == 240
+    check_store(agent, env.transitions)
+    # Nothing was half done: the agent stands where one does that was stopped after that step.
+    ours = state_of(agent)
+    twin = state_of(new_agent(gym.make(TOY, max_steps=60), learning_starts=1000).learn(240))
+    assert differences(twin["replay"], ours["replay"]) == []
+    for part in ("graph", "chaining", "discovery", "visited", "options", "parameters"):
+        assert differences(twin["agent"][part], ours["agent"][part]) == []
+    assert differences(twin["agent"]["progress"]["rng"], ours["agent"]["progress"]["rng"]) == []
+    check_goes_on(agent, [env], False)

@@ -1,0 +1,186 @@
+import csv
+import json
+from pathlib import Path
+
+import pytest
+import yaml
+
+from sb3_skillgraph import SkillGraphAgent, cli
+from sb3_skillgraph.callbacks import SkillGraphProgressBarCallback
+from sb3_skillgraph.envs import _TASKS
+from sb3_skillgraph.hyperparams import FILE, load_hyperparams
+from sb3_skillgraph.options.learner import OptionTD3
+
+TOY = "SkillGraph/ToyMaze-v0"
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    out = tmp_path_factory.mktemp("cli") / "toy"
+    arguments = ["--steps", "600", "--seed", "3", "--n-envs", "2", "--hyperparams", "learning_starts=100", "tau=1e-2"]
+    assert cli.main(["train", TOY, "--out", str(out), *arguments, "--env-kwargs", "max_steps=50"]) == 0
+    return out
+
+
+def error_line(capsys, argv):
+    try:
+        code = cli.main(argv)
+    except SystemExit as error:  # argparse's own way out
+        code = error.code
+    captured = capsys.readouterr()
+    assert code == 2
+    assert captured.err.count("\n") == 1, captured.err
+    assert captured.err.startswith("sb3-skillgraph")
+    return captured.err
+
+
+class TestTrain:
+    def test_leaves_agent_log_and_configuration(self, trained):
+        agent = SkillGraphAgent.load(trained / "agent.zip")
+        assert agent.num_timesteps == 600
+        assert agent.seed == 3 and agent.n_envs == 2 and agent.tau == 0.01
+        rows = list(csv.DictReader((trained / "progress.csv").read_text().splitlines()))
+        assert "skillgraph/events" in rows[-1]
+        config = json.loads((trained / "config.json").read_text())
+        assert config["env"] == TOY and config["seed"] == 3 and config["steps"] == 600
+        assert config["env_kwargs"] == {"max_steps": 50}
+        assert config["arguments"]["learning_starts"] == 100
+        assert "torch" in config["versions"]
+
+    def test_does_not_overwrite_an_agent(self, trained, capsys):
+        before = (trained / "agent.zip").read_bytes()
+        assert "holds an agent already" in error_line(capsys, ["train", TOY, "--out", str(trained)])
+        assert (trained / "agent.zip").read_bytes() == before
+
+    def test_interrupt_saves_the_agent(self, tmp_path, capsys, monkeypatch):
+        def interrupt(self):
+            if self.num_timesteps == 120:
+                raise KeyboardInterrupt
+            return True
+
+        monkeypatch.setattr(SkillGraphProgressBarCallback, "_on_step", interrupt)
+        assert cli.main(["train", TOY, "--steps", "500", "--out", str(tmp_path)]) == 130
+        captured = capsys.readouterr()
+        assert "interrupted" in captured.err and "agent.zip" in captured.out
+        assert SkillGraphAgent.load(tmp_path / "agent.zip").num_timesteps == 120
+
+    def test_takes_steps_from_yaml_and_names_the_folder(self, tmp_path, monkeypatch):
+        calls = []
+        monkeypatch.setattr(cli, "_learn", lambda *args: calls.append(args))
+        monkeypatch.chdir(tmp_path)
+        assert cli.main(["train", "SkillGraph/AntUMaze-v0", "--hyperparams", "gamma=0.9"]) == 0
+        _, _, hyperparams, steps, seed, out, *_ = calls[0]
+        assert steps == load_hyperparams("SkillGraph/AntUMaze-v0")["n_timesteps"]
+        assert hyperparams["gamma"] == 0.9 and hyperparams["option_class"] is OptionTD3
+        assert (seed, out) == (0, Path("runs/AntUMaze-v0-seed0"))
+
+
+class TestErrors:
+    @pytest.mark.parametrize(
+        ("argv", "words"),
+        [
+            (["train", "SkillGraph/ToyMaz-v0"], "did you mean 'SkillGraph/ToyMaze-v0'"),
+            (["train", "ToyMaze-v0"], "did you mean"),
+            (["train", "no_such_package:Env-v0"], "no_such_package"),
+            (["train", "CartPole-v1"], "goal environment"),
+            (["train", TOY, "--hyperparams", "gama=0.9"], "did you mean 'gamma'"),
+            (["train", TOY, "--hyperparams", "gamma=high"], "gamma must be a number, not 'high'"),
+            (["train", TOY, "--hyperparams", "salience=magic"], "Unknown salience 'magic'"),
+            (["train", TOY, "--hyperparams", "option_class=PPO"], "OptionDDPG"),
+            (["train", TOY, "--hyperparams", "gamma"], "NAME=VALUE"),
+            (["train", TOY, "--steps", "0"], "at least 1"),
+            (["train", TOY, "--env-kwargs", "maze=1"], "maze"),
+            (["train", "SkillGraph/PointMaze-v0"], "maze_map is required"),
+            (["evaluate", "nothing.zip", "--env", TOY], "no file"),
+            (["plot", "nothing.zip", "--env", TOY, "--out", "x"], "no file"),
+            (["evaluate", "nothing.zip", "--env", "CartPole-v1"], "maze"),
+            (["evaluate", "nothing.zip"], "--env"),
+            (["dance"], "dance"),
+        ],
+    )
+    def test_one_line_and_code_2(self, argv, words, capsys, tmp_path, monkeypatch):
+        monkeypatch.chdir(tmp_path)
+        assert words in error_line(capsys, argv)
+        assert not list(tmp_path.iterdir())
+
+    def test_damaged_file(self, trained, tmp_path, capsys):
+        damaged = tmp_path / "agent.zip"
+        damaged.write_bytes((trained / "agent.zip").read_bytes()[:1000])
+        assert "damaged" in error_line(capsys, ["evaluate", str(damaged), "--env", TOY])
+
+    def test_wrong_environment(self, trained, capsys):
+        argv = ["evaluate", str(trained / "agent.zip"), "--env", "SkillGraph/PointMazeUMaze-v0"]
+        assert "spaces do not match" in error_line(capsys, argv)
+
+
+class TestEvaluateAndPlot:
+    def test_evaluate_writes_every_pair(self, trained, tmp_path, capsys):
+        out = tmp_path / "result.json"
+        argv = ["evaluate", str(trained / "agent.zip"), "--env", TOY, "--pairs", "4", "--seed", "1", "--out", str(out)]
+        assert cli.main(argv) == 0
+        result = json.loads(out.read_text())
+        assert len(result["pairs"]) == 4
+        assert result["success_rate"] == sum(pair["success"] for pair in result["pairs"]) / 4
+        assert "95 % interval" in capsys.readouterr().out
+
+    def test_adapt_and_no_planning(self, trained):
+        argv = ["evaluate", str(trained / "agent.zip"), "--env", TOY, "--pairs", "1"]
+        assert cli.main([*argv, "--no-planning"]) == 0
+        assert cli.main([*argv, "--adapt", "20"]) == 0
+
+    def test_plot_leaves_two_pictures(self, trained, tmp_path):
+        assert cli.main(["plot", str(trained / "agent.zip"), "--env", TOY, "--out", str(tmp_path)]) == 0
+        assert {path.name for path in tmp_path.iterdir()} == {"skill_graph.png", "plan.png"}
+
+
+def test_demo_leaves_everything(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(cli, "DEMO_ENV", TOY)
+    assert cli.main(["demo", "--steps", "300", "--pairs", "3", "--out", str(tmp_path)]) == 0
+    expected = {"agent.zip", "progress.csv", "config.json", "results.json", "skill_graph.png", "plan.png"}
+    assert {path.name for path in tmp_path.iterdir()} == expected
+    results = json.loads((tmp_path / "results.json").read_text())
+    assert list(results) == ["skill graph", "planning off", "random walk"]
+    assert all(len(result["pairs"]) == 3 for result in results.values())
+    printed = capsys.readouterr().out
+    assert "random walk" in printed and "coverage" in printed
+
+
+@pytest.mark.parametrize("command", ["train", "evaluate", "plot", "demo"])
+def test_help_shows_an_example(command, capsys):
+    with pytest.raises(SystemExit) as exit_:
+        cli.main([command, "--help"])
+    assert exit_.value.code == 0
+    assert f"example:\n  sb3-skillgraph {command}" in capsys.readouterr().out
+
+
+class TestHyperparams:
+    @pytest.mark.parametrize("env_id", _TASKS)
+    def test_every_environment_has_an_entry(self, env_id):
+        assert env_id in yaml.safe_load(FILE.read_text())
+        hyperparams = load_hyperparams(env_id)
+        assert hyperparams["n_timesteps"] > 0 and hyperparams["policy"] == "MultiInputPolicy"
+
+    def test_an_environment_without_entry_gets_the_defaults(self):
+        assert load_hyperparams("Mine-v0") == {"n_timesteps": 100_000, "policy": "MultiInputPolicy"}
+
+    @pytest.mark.parametrize(
+        ("text", "words"),
+        [
+            ("Mine-v0: {learning_rat: 1}", "custom.yml, entry 'Mine-v0': unknown argument 'learning_rat'; did you mean"),
+            ("Mine-v0: [1, 2]", "custom.yml, entry 'Mine-v0': a mapping"),
+            ("[1, 2]", "custom.yml, entry 'defaults': a mapping"),
+            ("Mine-v0: {", "custom.yml is no valid YAML"),
+        ],
+    )
+    def test_mistakes_name_file_and_entry(self, text, words, tmp_path):
+        path = tmp_path / "custom.yml"
+        path.write_text(text)
+        with pytest.raises(ValueError) as error:
+            load_hyperparams("Mine-v0", path)
+        assert str(error.value).startswith(words)
+
+    def test_an_entry_wins_over_defaults(self, tmp_path):
+        path = tmp_path / "custom.yml"
+        path.write_text("defaults: {gamma: 0.9, n_timesteps: 1e5}\nMine-v0: {gamma: 0.95, learning_rate: 1e-3}\n")
+        expected = {"gamma": 0.95, "n_timesteps": 100_000, "learning_rate": 0.001}
+        assert load_hyperparams("Mine-v0", path) == expected

@@ -1,0 +1,294 @@
+"""The agent learns: on the NumPy maze, its zero-shot success is far above what no learning gives."""
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from conftest import EAGER, SMALL, TOY, Recorder, check_store, new_agent, new_vec_env
+from gymnasium import spaces
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from stable_baselines3 import DDPG, SAC, TD3
+from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
+from stable_baselines3.common.type_aliases import TrainFrequencyUnit
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+from sb3_skillgraph import PAPER, OptionEnv, SkillGraphAgent
+from sb3_skillgraph.envs import MazeMap
+from sb3_skillgraph.evaluation import evaluate_pairs
+from sb3_skillgraph.events import SalientEvent
+from sb3_skillgraph.options.learner import OptionTD3
+
+ZIGZAG: MazeMap = [[1] * 7, [1, "r", 0, 0, 0, 0, 1], [1, 1, 1, 1, 1, 0, 1], [1, 0, 0, 0, 0, 0, 1], [1] * 7]
+
+
+class RandomWalk:
+    def __init__(self) -> None:
+        self.rng = np.random.default_rng(0)
+
+    def predict(self, observation: Any, *_: Any, **__: Any) -> tuple[np.ndarray, None]:
+        return self.rng.uniform(-1, 1, 2).astype(np.float32), None
+
+
+def test_reaches_goals_it_never_trained_on() -> None:
+    agent = SkillGraphAgent("MultiInputPolicy", gym.make(TOY), **{**SMALL, "policy_kwargs": dict(net_arch=[32, 32])})
+    untrained = evaluate_pairs(agent, TOY).success_rate
+    random = evaluate_pairs(RandomWalk(), TOY).success_rate
+    agent.learn(5000, log_interval=None)
+    trained = evaluate_pairs(agent, TOY).success_rate
+    assert trained > max(untrained, random) + 0.2
+    assert trained > 0.6
+    summary = agent.graph_summary()
+    assert summary["coverage"] > 0.7
+    assert summary["joined_pairs"] > 0.3
+
+
+@pytest.mark.parametrize(
+    ("option_class", "extra"),
+    [(TD3, {}), (SAC, {}), (OptionTD3, {}), (DDPG, dict(learning_rate=lambda left: 1e-3 * left))],
+    ids=["TD3", "SAC", "OptionTD3", "DDPG with a schedule"],
+)
+def test_other_option_classes_learn(option_class: type, extra: dict[str, Any]) -> None:
+    agent = new_agent(option_class=option_class, learning_starts=100, **extra)
+    before = {name: value.clone() for name, value in agent.policy.state_dict().items()}
+    agent.learn(500)
+    assert isinstance(agent.global_option.learner, option_class)
+    assert agent.options
+    assert all(isinstance(option.learner, option_class) for option in agent.options)
+    after = agent.policy.state_dict()
+    assert any(not np.array_equal(before[name], after[name]) for name in before if "actor" in name)
+    assert all(np.isfinite(value).all() for value in after.values())
+
+
+@pytest.mark.parametrize("n_envs", [1, 2])
+@pytest.mark.parametrize("noise_class", [NormalActionNoise, OrnsteinUhlenbeckActionNoise])
+def test_action_noise_is_what_explores(noise_class: type, n_envs: int) -> None:
+    def actions(sigma: float) -> np.ndarray:
+        noise = noise_class(np.zeros(2), sigma * np.ones(2))
+        agent = new_agent(new_vec_env(n_envs=n_envs), action_noise=noise, random_action_prob=0.0, learning_starts=0)
+        agent.learn(60)
+        return agent.store.get_state()["columns"]["action"]
+
+    assert not np.array_equal(actions(0.5), actions(0.0))
+    assert np.abs(actions(0.5)).max() <= 1.0
+    assert len(actions(0.5)) == 60
+
+
+@pytest.mark.parametrize("n_envs", [1, 2])
+def test_the_paper_as_written(n_envs: int) -> None:
+    arguments = {**PAPER, **EAGER, "policy_kwargs": dict(net_arch=[16, 16]), "salient_event_freq": 2, "retry_after": 1}
+    agent = SkillGraphAgent("MultiInputPolicy", new_vec_env(n_envs=n_envs, max_steps=60), **arguments).learn(1500)
+    assert len(agent.events) >= 3
+    assert agent.options
+    assert any(option.mature for option in agent.options)
+    assert any(option.learner._n_updates > 0 for option in agent.options)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        dict(train_freq=(1, "episode"), gradient_steps=-1),
+        dict(train_freq=8, gradient_steps=8),
+        dict(gradient_steps=0),
+        dict(global_update_fraction=1.0),
+        dict(warm_start=False, global_update_fraction=0.0),
+        dict(shared_experience=0.0, hindsight=0.0),
+        dict(salience="rrt", target_choice="uniform", max_unconnected=None, event_tries=1),
+        dict(nearest="euclidean"),
+        dict(buffer_size=100),
+    ],
+    ids=lambda arguments: next(iter(arguments)),
+)
+def test_arguments_work_together(arguments: dict[str, Any]) -> None:
+    agent = new_agent(learning_starts=100, **arguments).learn(450)
+    assert agent.num_timesteps >= 450
+    assert agent.store.total == agent.num_timesteps
+    per_step = agent.train_freq.unit == TrainFrequencyUnit.STEP
+    n_expected = 0 if agent.gradient_steps == 0 else agent.num_timesteps - 100
+    assert abs(agent._n_updates - n_expected) <= (8 if per_step else 100)
+
+
+def test_salience_may_be_an_object() -> None:
+    class Corners:
+        def propose(self, rng: np.random.Generator) -> np.ndarray:
+            return np.array([[-1.0, -1.0], [1.0, 1.0], [1.0, -1.0]])[rng.integers(3)]
+
+    agent = new_agent(salience=Corners()).learn(1200)
+    assert len(agent.events) >= 2
+    for event in agent.events[1:]:
+        assert np.abs(event.center).tolist() == [1.0, 1.0]
+
+
+def test_another_maze_and_another_range_of_actions() -> None:
+    env = Recorder(gym.wrappers.RescaleAction(gym.make(TOY, maze_map=ZIGZAG), np.float32(2.0), np.float32(6.0)))
+    agent = new_agent(env).learn(600)
+    actions = np.array([step["action"] for step in env.transitions])
+    assert actions.min() >= 2.0
+    assert actions.max() <= 6.0
+    assert actions.max() - actions.min() > 3.0
+    check_store(agent, env.transitions)
+    obs, _ = env.reset()
+    assert agent.action_space.contains(agent.predict(obs)[0])
+
+
+class Space(gym.Env):
+    """A goal of three dimensions, an observation of two by three, and perhaps an entry that nobody asked for."""
+
+    distance_threshold = 0.3
+
+    def __init__(self, extra: bool = False) -> None:
+        point = spaces.Box(-np.inf, np.inf, (3,), np.float64)
+        observation = spaces.Box(-np.inf, np.inf, (2, 3), np.float64)
+        entries = dict(observation=observation, achieved_goal=point, desired_goal=point)
+        self.observation_space = spaces.Dict({**entries, **({"clock": spaces.Discrete(51)} if extra else {})})
+        self.action_space = spaces.Box(-1.0, 1.0, (3, 1), np.float32)
+
+    def _observe(self) -> dict[str, Any]:
+        state = np.stack([self.position, self.velocity])
+        entries = dict(observation=state, achieved_goal=self.position.copy(), desired_goal=self.goal, clock=self.clock)
+        return {key: entries[key] for key in self.observation_space.spaces}
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.position, self.velocity, self.clock = np.zeros(3), np.zeros(3), 0
+        self.goal = self.np_random.uniform(-1, 1, 3)
+        return self._observe(), {}
+
+    def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        self.velocity = 0.2 * np.asarray(action, dtype=np.float64).ravel()
+        self.position = np.clip(self.position + self.velocity, -1.0, 1.0)
+        self.clock += 1
+        return self._observe(), 0.0, False, self.clock == 50, {}
+
+
+@pytest.mark.parametrize("extra", [False, True])
+def test_goals_of_three_dimensions(tmp_path: Any, extra: bool) -> None:
+    env = Space(extra)
+    agent = new_agent(env).learn(600)
+    assert agent.event_radius == 0.3
+    assert all(event.center.shape == (3,) for event in agent.events)
+    assert agent.options
+    agent.save(tmp_path / "agent")
+    loaded = SkillGraphAgent.load(tmp_path / "agent", env=Space(extra))
+    obs, _ = env.reset()
+    action, _ = loaded.predict(obs)
+    assert action.shape == (3, 1)
+    assert np.array_equal(action, agent.predict(obs)[0])
+    assert loaded.learn(100, reset_num_timesteps=False).num_timesteps == 700
+
+
+# -- every transition is in the store exactly once --------------------------------------------------------------------
+
+
+@settings(max_examples=8, deadline=None)
+@given(
+    n_envs=st.integers(1, 3),
+    calls=st.lists(st.tuples(st.integers(1, 70), st.booleans(), st.integers(1, 90)), min_size=1, max_size=4),
+    max_steps=st.integers(5, 40),
+)
+def test_every_transition_is_in_the_store_once(
+    n_envs: int, calls: list[tuple[int, bool, int]], max_steps: int
+) -> None:
+    recorders = [Recorder(gym.make(TOY, max_steps=max_steps)) for _ in range(n_envs)]
+    agent = new_agent(DummyVecEnv([lambda env=env: env for env in recorders]), learning_starts=30)
+    for n_steps, reset_num_timesteps, stop_at in calls:
+        counter = iter(range(1, 1000))
+        stopped = False
+
+        def callback(*_: Any, counter: Any = counter, stop_at: int = stop_at) -> bool:
+            nonlocal stopped
+            stopped = next(counter) == stop_at
+            return not stopped
+
+        n_before = agent.store.total
+        agent.learn(n_steps, callback=callback, reset_num_timesteps=reset_num_timesteps)
+        if stopped:
+            for recorder in recorders:
+                del recorder.transitions[-1]
+        assert stopped or agent.store.total > n_before or not reset_num_timesteps
+        for i, recorder in enumerate(recorders):
+            check_store(agent, recorder.transitions, i)
+
+
+# -- OptionEnv --------------------------------------------------------------------------------------------------------
+
+
+def option_env(**kwargs: Any) -> tuple[OptionEnv, Recorder]:
+    base = Recorder(gym.make(TOY, max_steps=50))
+    return OptionEnv(base, SalientEvent("east", np.array([1.0, 1.0]), 0.45), **kwargs), base
+
+
+def test_option_env_is_a_wrapper_with_a_flat_space() -> None:
+    env, base = option_env()
+    assert isinstance(env, gym.Wrapper)
+    assert env.observation_space.shape == (6,)
+    assert env.observation_space.dtype == np.float32
+    obs, info = env.reset(seed=0)
+    assert env.observation_space.contains(obs)
+    assert info["can_start"]
+    assert env.unwrapped is base.unwrapped
+
+
+def test_option_env_pays_and_ends_by_the_option() -> None:
+    env, _ = option_env()
+    env.reset(seed=0)
+    rewards, over = [], False
+    while not over:
+        _, reward, terminated, truncated, info = env.step(np.array([1.0, 0.0], dtype=np.float32))
+        rewards.append(reward)
+        over = terminated or truncated
+    assert terminated
+    assert not truncated
+    assert info["is_success"]
+    assert rewards == [-1.0] * (len(rewards) - 1) + [0.0]
+    assert 4 <= len(rewards) <= 8  # two cells, less the radius, a quarter cell a step
+
+
+def test_option_env_goes_on_where_the_last_run_ended() -> None:
+    env, base = option_env(timeout=5)
+    env.reset(seed=0)
+    still = np.array([-0.01, 0.0], dtype=np.float32)
+    for run in range(10):
+        for step in range(5):
+            obs, reward, terminated, truncated, _ = env.step(still)
+            assert (reward, terminated, truncated) == (-1.0, False, step == 4)
+        n_resets = 1 + (run == 9)  # after 50 steps the episode of the maze is over
+        again, _ = env.reset()
+        assert len(base.starts) == n_resets
+        assert np.array_equal(obs, again) == (run < 9)
+    env.reset(seed=1)
+    assert len(base.starts) == 3
+    env.reset(options={"start": [1.0, -1.0]})
+    assert len(base.starts) == 4
+    np.testing.assert_array_equal(base.starts[-1], [1.0, -1.0])
+
+
+def test_option_env_is_truncated_with_its_environment() -> None:
+    env, _ = option_env(timeout=200)
+    env.reset(seed=0)
+    ends = [env.step(np.zeros(2, dtype=np.float32))[2:4] for _ in range(50)]
+    assert ends == [(False, False)] * 49 + [(False, True)]
+
+
+def test_option_env_leads_into_the_initiation_set_of_an_option(trained: SkillGraphAgent) -> None:
+    parent = next(option for option in trained.options if option.mature)
+    env = OptionEnv(gym.make(TOY), parent, initiation=parent.initiation)
+    inside = parent.initiation.core
+    _, info = env.reset(options={"start": inside})
+    assert info["can_start"]
+    _, reward, terminated, _, info = env.step(np.zeros(2, dtype=np.float32))
+    assert (reward, terminated, info["is_success"]) == (0.0, True, True)
+
+
+def test_sb3_learns_on_option_env() -> None:
+    env, base = option_env()
+    model = DDPG("MlpPolicy", env, seed=0, learning_starts=300, policy_kwargs=dict(net_arch=[32, 32]), batch_size=64)
+    model.learn(1500)
+    assert 10 <= len(base.starts) <= 32
+    obs, _ = env.reset(seed=5)
+    for _ in range(20):
+        obs, _, terminated, _, _ = env.step(model.predict(obs, deterministic=True)[0])
+        if terminated:
+            break
+    assert terminated

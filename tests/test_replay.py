@@ -1,0 +1,357 @@
+import copy
+from typing import Any
+
+import numpy as np
+import pytest
+import torch as th
+from builders import make_factory, profile
+from gymnasium import spaces
+from hypothesis import given
+from hypothesis import strategies as st
+from stable_baselines3.common.type_aliases import ReplayBufferSamples
+
+from sb3_skillgraph.envs import ToyMazeEnv
+from sb3_skillgraph.events import SalientEvent
+from sb3_skillgraph.options.env import OptionEnv
+from sb3_skillgraph.options.option import goal_rule, termination_rule
+from sb3_skillgraph.options.views import ScaledView, relative_view
+from sb3_skillgraph.replay import OptionReplay, OptionRule, TransitionStore
+
+CAPACITY = 12
+#: One step of all environments: who is done, and whether the store is cut afterwards.
+Step = tuple[list[bool], bool]
+steps = st.lists(
+    st.tuples(st.lists(st.integers(0, 3).map(lambda k: k == 0), min_size=3, max_size=3), st.integers(0, 7).map(lambda k: k == 0)),
+    min_size=1,
+    max_size=25,
+)
+
+
+class Written:
+    """A store filled step by step, and beside it what went in: every row's trajectory, by env and count."""
+
+    def __init__(self, n_envs: int, capacity: int = CAPACITY) -> None:
+        self.store = TransitionStore(capacity, 3, 2, 1, n_envs)
+        self.n_envs = n_envs
+        self.trajectory: list[tuple[int, int]] = []
+        self._count = [0] * n_envs
+
+    def add(self, done: list[bool], cut: bool) -> np.ndarray:
+        n, first = self.n_envs, self.store.total
+        numbers = np.arange(first, first + n, dtype=np.float32)[:, None]
+        ended = np.array(done[:n])
+        rows = self.store.add(
+            np.repeat(numbers, 3, axis=1),
+            np.repeat(numbers, 2, axis=1),
+            np.repeat(numbers + 0.5, 3, axis=1),
+            np.repeat(numbers + 0.5, 2, axis=1),
+            numbers,
+            np.repeat(-numbers, 2, axis=1),
+            ended & (first % 2 == 0),
+            ended,
+        )
+        for env in range(n):
+            self.trajectory.append((env, self._count[env]))
+            self._count[env] += done[env]
+        if cut:
+            self.store.cut()
+            self._count = [count + 1 for count in self._count]
+        return rows
+
+
+@given(st.integers(1, 3), steps)
+@profile(60)
+def test_rows_keep_their_numbers_until_overwritten(n_envs: int, sequence: list[Step]) -> None:
+    written = Written(n_envs)
+    store = written.store
+    for done, cut in sequence:
+        rows = written.add(done, cut)
+        np.testing.assert_array_equal(rows, np.arange(store.total - n_envs, store.total))
+        assert len(store) == min(store.total, CAPACITY)
+        assert store.oldest == store.total - len(store)
+        readable = np.arange(store.oldest, store.total)
+        np.testing.assert_array_equal(store.column("action", readable)[:, 0], readable)
+        np.testing.assert_array_equal(store.column("observation", readable)[:, 2], readable)
+        np.testing.assert_array_equal(store.column("next_achieved_goal", readable)[:, 1], readable + 0.5)
+        np.testing.assert_array_equal(store.column("goal", readable)[:, 0], -readable)
+    expected = [sequence[row // n_envs][0][row % n_envs] and row // n_envs * n_envs % 2 == 0 for row in readable]
+    assert store.terminated(readable).tolist() == expected
+
+
+@given(st.integers(1, 3), steps, st.integers(1, 6))
+@profile(80)
+def test_future_stays_on_the_trajectory(n_envs: int, sequence: list[Step], horizon: int) -> None:
+    written = Written(n_envs)
+    rng = np.random.default_rng(0)
+    for done, cut in sequence:
+        written.add(done, cut)
+    store = written.store
+    rows = np.arange(store.oldest, store.total)
+    for _ in range(8):
+        for row, later in zip(rows, store.future(rows, horizon, rng), strict=True):
+            assert row <= later < store.total
+            assert (later - row) % n_envs == 0
+            assert (later - row) // n_envs < horizon
+            assert written.trajectory[later] == written.trajectory[row]
+
+
+@pytest.mark.parametrize("horizon", [1, 3, 100])
+def test_future_reaches_everything_within_the_horizon(horizon: int) -> None:
+    written = Written(2, capacity=40)
+    for t in range(10):
+        written.add([t == 6, t == 3, False], False)
+    rng = np.random.default_rng(0)
+    row = np.full(400, 4)  # step 2 of env 0, whose episode ends at step 6
+    assert set(written.store.future(row, horizon, rng)) == set(range(4, 4 + 2 * min(horizon, 5), 2))
+
+
+def test_after_a_cut_trajectories_do_not_mix() -> None:
+    written = Written(2, capacity=40)
+    for t in range(6):
+        written.add([False] * 3, t == 2)
+    rng = np.random.default_rng(0)
+    early, late = np.arange(6), np.arange(6, 12)
+    for _ in range(50):
+        assert written.store.future(early, 100, rng).max() < 6
+        assert written.store.future(late, 100, rng).max() >= 6
+
+
+@given(st.integers(1, 3), steps, steps)
+@profile(40)
+def test_store_state_round_trip(n_envs: int, before: list[Step], after: list[Step]) -> None:
+    written = Written(n_envs)
+    for done, cut in before:
+        written.add(done, cut)
+    restored = Written(n_envs)
+    restored.store.set_state(copy.deepcopy(written.store.get_state()))
+    restored._count = [*written._count]
+    for done, cut in after:
+        written.add(done, cut)
+        restored.add(done, cut)
+    rows = np.arange(written.store.oldest, written.store.total)
+    assert (restored.store.oldest, restored.store.total) == (written.store.oldest, written.store.total)
+    for name in ("observation", "achieved_goal", "next_observation", "next_achieved_goal", "action", "goal"):
+        np.testing.assert_array_equal(restored.store.column(name, rows), written.store.column(name, rows))
+    np.testing.assert_array_equal(restored.store.terminated(rows), written.store.terminated(rows))
+    draws = [w.store.future(rows, 10, np.random.default_rng(0)) for w in (written, restored)]
+    np.testing.assert_array_equal(draws[0], draws[1])
+
+
+@pytest.mark.parametrize(
+    ("other", "named"),
+    [
+        (TransitionStore(24, 3, 2, 1, 2), "capacity"),
+        (TransitionStore(12, 3, 2, 1, 1), "n_envs"),
+        (TransitionStore(12, 4, 2, 1, 2), "observation"),
+        (TransitionStore(12, 3, 3, 1, 2), "achieved_goal"),
+    ],
+)
+def test_state_of_another_shape_is_refused(other: TransitionStore, named: str) -> None:
+    with pytest.raises(ValueError, match=named):
+        other.set_state(TransitionStore(12, 3, 2, 1, 2).get_state())
+
+
+# -- an option's view -------------------------------------------------------------------------------------------------
+
+RADIUS = 2.0
+EVENT = SalientEvent("e0", np.array([3.0, 3.0]), 3.0)
+OBSERVATION_DIM = 1
+
+
+def raw_view(observation: np.ndarray, achieved_goal: np.ndarray, goal: np.ndarray) -> np.ndarray:
+    return np.concatenate([observation, achieved_goal, goal], axis=1).astype(np.float32)
+
+
+class SpyStore(TransitionStore):
+    """A store that objects to reading what has been overwritten or not yet written."""
+
+    def column(self, name: str, rows: np.ndarray) -> np.ndarray:
+        assert ((rows >= self.oldest) & (rows < self.total)).all()
+        return super().column(name, rows)
+
+
+def walked_store(capacity: int = 400, n_steps: int = 60, n_envs: int = 2, seed: int = 0) -> TransitionStore:
+    """Random walks; the action tells the row, the pursued goal is one that nothing ever achieves."""
+    rng = np.random.default_rng(seed)
+    store = SpyStore(capacity, OBSERVATION_DIM, 2, 1, n_envs)
+    point = np.zeros((n_envs, 2))
+    for t in range(n_steps):
+        following = point + rng.normal(0.3, 1.5, point.shape)
+        done = rng.random(n_envs) < 0.1
+        number = np.arange(store.total, store.total + n_envs, dtype=np.float32)[:, None]
+        store.add(number, point, number, following, number, np.full((n_envs, 2), 1e4), done & (t % 3 > 0), done)
+        point = np.where(done[:, None], 0.0, following)
+    return store
+
+
+def make_replay(store: TransitionStore, rule: OptionRule, **kwargs: Any) -> OptionReplay:
+    return OptionReplay(
+        store,
+        raw_view,
+        rule,
+        spaces.Box(-np.inf, np.inf, (OBSERVATION_DIM + 4,), np.float32),
+        spaces.Box(-1.0, 1.0, (1,), np.float32),
+        np.random.default_rng(1),
+        device="cpu",
+        **kwargs,
+    )
+
+
+def check_relabelling(store: TransitionStore, samples: ReplayBufferSamples, *, ends_in_event: bool) -> np.ndarray:
+    """Recompute every sampled transition by hand.
+
+    :return: which of them were imagined
+    """
+    seen, following = samples.observations.numpy(), samples.next_observations.numpy()
+    rows = samples.actions.numpy()[:, 0].astype(int)
+    goals = seen[:, -2:]
+    imagined = goals[:, 0] != 1e4
+    np.testing.assert_array_equal(following[:, -2:], goals)
+    for i, row in enumerate(rows):
+        number = np.array([row])
+        np.testing.assert_array_equal(seen[i, :-2], np.r_[row, store.column("achieved_goal", number)[0]])
+        end = store.column("next_achieved_goal", number)[0]
+        np.testing.assert_array_equal(following[i, :-2], np.r_[row, end])
+        if imagined[i] or not ends_in_event:
+            reached = np.linalg.norm(end - goals[i]) <= RADIUS
+        else:
+            reached = np.linalg.norm(end - EVENT.center) <= EVENT.radius
+        assert samples.rewards[i, 0] == (0.0 if reached else -1.0)
+        assert samples.dones[i, 0] == float(reached or store.terminated(number)[0])
+    achieved = {tuple(store.column("next_achieved_goal", np.array([row]))[0]) for row in range(store.oldest, store.total)}
+    assert {tuple(goal) for goal in goals[imagined]} <= achieved
+    return imagined
+
+
+@pytest.mark.parametrize(("hindsight", "shared"), [(0.0, 0.0), (0.8, 0.0), (0.8, 0.5), (1.0, 0.0), (0.0, 1.0)])
+def test_reward_and_end_follow_the_rule(hindsight: float, shared: float) -> None:
+    store = walked_store()
+    replay = make_replay(store, termination_rule(EVENT, RADIUS), hindsight=hindsight, shared=shared)
+    replay.add_rows(np.arange(10, 50))
+    imagined = check_relabelling(store, replay.sample(300), ends_in_event=True)
+    expected = shared + (1.0 - shared) * hindsight
+    assert abs(imagined.mean() - expected) <= (0.06 if 0 < hindsight < 1 and shared < 1 else 0.0)
+
+
+def test_the_global_options_rule_is_the_distance_to_its_goal() -> None:
+    store = walked_store()
+    replay = make_replay(store, goal_rule(RADIUS), everything=True, hindsight=0.6)
+    samples = replay.sample(1500)
+    imagined = check_relabelling(store, samples, ends_in_event=False)
+    assert abs(imagined.mean() - 0.6) < 0.06
+    assert set(samples.actions.numpy()[:, 0].astype(int)) == set(range(120))
+    assert replay.size() == 120
+
+
+def test_both_outcomes_occur_in_the_walks() -> None:
+    """The relabelling tests above see successes, failures and ends of both kinds."""
+    store = walked_store()
+    replay = make_replay(store, termination_rule(EVENT, RADIUS), hindsight=0.0, shared=0.0)
+    replay.add_rows(np.arange(0, 120))
+    samples = replay.sample(1500)
+    reached, done = samples.rewards.numpy() == 0.0, samples.dones.numpy() == 1.0
+    assert {(bool(r), bool(d)) for r, d in zip(reached, done, strict=True)} == {(False, False), (True, True), (False, True)}
+
+
+@pytest.mark.parametrize("shared", [0.0, 0.25, 1.0])
+def test_a_share_of_every_batch_comes_from_the_whole_store(shared: float) -> None:
+    store = walked_store()
+    replay = make_replay(store, termination_rule(EVENT, RADIUS), hindsight=0.0, shared=shared)
+    replay.add_rows(np.array([3, 7, 11]))
+    samples = replay.sample(200)
+    own = samples.observations.numpy()[:, -1] == 1e4  # own rows keep their goal here, shared ones never do
+    assert own.sum() == 200 - 200 * shared
+    rows = samples.actions.numpy()[:, 0].astype(int)
+    assert set(rows[own]) == (set() if shared == 1.0 else {3, 7, 11})
+    assert shared == 0.0 or len(set(rows[~own])) > 20
+
+
+def test_without_rows_of_its_own_an_option_learns_from_the_whole_store_in_hindsight() -> None:
+    store = walked_store()
+    replay = make_replay(store, termination_rule(EVENT, RADIUS), hindsight=0.0, shared=0.5)
+    assert replay.size() == 0
+    assert check_relabelling(store, replay.sample(100), ends_in_event=True).all()
+
+
+@given(st.lists(st.integers(1, 9), min_size=2, max_size=12), st.booleans())
+@profile(30)
+def test_a_view_never_reads_an_overwritten_row(turns: list[int], everything: bool) -> None:
+    store = SpyStore(20, OBSERVATION_DIM, 2, 1, 1)
+    replay = make_replay(store, termination_rule(EVENT, RADIUS), everything=everything, capacity=10)
+    for k, n in enumerate(turns):
+        for _ in range(n):
+            number = np.full((1, 1), store.total, dtype=np.float32)
+            point = np.full((1, 2), store.total, dtype=np.float32)
+            no = np.zeros(1, dtype=bool)
+            row = store.add(number, point, number, point, number, np.full((1, 2), 1e4), no, no)
+            if k % 2 == 0:
+                replay.add_rows(row)
+        samples = replay.sample(16)
+        rows = samples.actions.numpy()[:, 0].astype(int)
+        assert ((rows >= store.oldest) & (rows < store.total)).all()
+        np.testing.assert_array_equal(samples.observations.numpy()[:, 1], rows)
+        assert replay.size() <= len(store)
+
+
+def test_only_the_newest_own_rows_are_kept() -> None:
+    store = walked_store(n_steps=100)
+    replay = make_replay(store, termination_rule(EVENT, RADIUS), hindsight=0.0, shared=0.0, capacity=20)
+    for row in range(0, 200, 2):
+        replay.add_rows(np.array([row]))
+    assert 10 <= replay.size() <= 20
+    rows = set(replay.sample(400).actions.numpy()[:, 0].astype(int))
+    assert rows == set(range(200 - 2 * replay.size(), 200, 2))
+
+
+def test_replay_state_round_trip() -> None:
+    store = walked_store(capacity=60, n_steps=100)
+    replay = make_replay(store, termination_rule(EVENT, RADIUS))
+    replay.add_rows(np.arange(100, 180))
+    restored = make_replay(store, termination_rule(EVENT, RADIUS))
+    restored.set_state(copy.deepcopy(replay.get_state()))
+    assert restored.size() == replay.size() == 40  # rows 140 to 179 can still be read
+    for one, other in zip(replay.sample(64), restored.sample(64), strict=True):
+        assert (one is None and other is None) or th.equal(one, other)
+
+
+def test_option_env_and_view_agree_on_the_same_transitions() -> None:
+    env = ToyMazeEnv([[1] * 5, *[[1, 0, 0, 0, 1]] * 3, [1] * 5], terminate_on_success=True)
+    event = SalientEvent("e0", np.array([1.0, 0.0]), 0.45)
+    option_env = OptionEnv(env, event, timeout=15)
+    rng = np.random.default_rng(0)
+    store = TransitionStore(3000, 2, 2, 2)
+    stepped = []
+    for _ in range(60):
+        option_env.reset(options={"start": np.zeros(2), "goal": np.array([0.0, 1.0])})
+        raw = env._observe()
+        for _ in range(15):
+            action = rng.uniform(-0.7, 1, 2).astype(np.float32)
+            following, reward, terminated, truncated, info = option_env.step(action)
+            inner = env._observe()
+            env_ended = bool(terminated and not info["is_success"])
+            before, after = [raw["achieved_goal"][None]] * 2, [inner["achieved_goal"][None]] * 2
+            store.add(*before, *after, action[None], event.center[None], np.array([env_ended]), np.array([env_ended]))
+            stepped.append((action, following, reward, terminated))
+            assert not (terminated and truncated)
+            raw = inner
+            if terminated or truncated:
+                break
+    rewards = [reward for _, _, reward, _ in stepped]
+    assert {0.0, -1.0} == set(rewards)
+    assert any(terminated and reward == -1.0 for _, _, reward, terminated in stepped)  # the environment ended it
+    factory = make_factory(store, radius=event.radius, hindsight=0.0, shared=0.0)
+    replay = factory.make("o1", event.id, event).replay
+    assert isinstance(replay.view, ScaledView)
+    assert replay.view.function is relative_view
+    replay.add_rows(np.arange(store.total))
+    samples = replay.sample(3000)
+    row_of = {tuple(action): row for row, (action, *_) in enumerate(stepped)}
+    seen = set()
+    for i, action in enumerate(samples.actions.numpy()):
+        row = row_of[tuple(action)]
+        seen.add(row)
+        _, following, reward, terminated = stepped[row]
+        assert samples.rewards[i, 0] == reward
+        assert bool(samples.dones[i, 0]) == terminated
+        np.testing.assert_allclose(samples.next_observations[i], following, atol=1e-5)
+    assert {row for row, reward in enumerate(rewards) if reward == 0.0} & seen

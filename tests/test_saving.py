@@ -1,0 +1,294 @@
+"""Saving and loading: SB3's signatures, and round trips that lose nothing."""
+
+import io
+import pathlib
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from conftest import TOY, differences, new_agent, new_vec_env, state_in, state_of
+from stable_baselines3 import SAC
+from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise, VectorizedActionNoise
+
+from sb3_skillgraph import SkillGraphAgent
+from sb3_skillgraph.events import SalientEvent
+
+
+def observations(n: int = 16) -> dict[str, np.ndarray]:
+    points = np.random.default_rng(3).uniform(-1.5, 1.5, (2, n, 2))
+    return {"observation": points[0], "achieved_goal": points[0], "desired_goal": points[1]}
+
+
+def flat(parameters: Any) -> dict[str, Any]:
+    """A nested dict of parameters as one level, without the tensors' ties to the agent."""
+    if isinstance(parameters, dict):
+        return {f"{k}.{name}": v for k, part in parameters.items() for name, v in flat(part).items()}
+    return {"": parameters.detach().clone() if isinstance(parameters, th.Tensor) else parameters}
+
+
+# -- save and load ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("as_path", [str, pathlib.Path])
+@pytest.mark.parametrize("name", ["agent", "agent.zip", "best.model"])
+def test_paths(trained: SkillGraphAgent, tmp_path: Path, as_path: Callable[[str], Any], name: str) -> None:
+    path = as_path(str(tmp_path / "new" / name))
+    trained.save(path)
+    assert [file.name for file in (tmp_path / "new").iterdir()] == ["agent.zip" if name == "agent" else name]
+    loaded = SkillGraphAgent.load(path)
+    assert differences(trained.predict(observations()), loaded.predict(observations())) == []
+
+
+def test_file_objects(trained: SkillGraphAgent, tmp_path: Path) -> None:
+    expected = state_of(trained)
+    with open(tmp_path / "agent", "wb") as file, open(tmp_path / "replay", "wb") as replay_file:
+        trained.save(file)
+        trained.save_replay_buffer(replay_file)
+    with open(tmp_path / "agent", "rb") as file, open(tmp_path / "replay", "rb") as replay_file:
+        loaded = SkillGraphAgent.load(file, env=gym.make(TOY))
+        loaded.load_replay_buffer(replay_file)
+        assert not file.closed
+    assert differences(expected, state_of(loaded)) == []
+
+
+def test_loading_gives_the_same_agent(trained: SkillGraphAgent, tmp_path: Path) -> None:
+    trained.save(tmp_path / "agent")
+    loaded = SkillGraphAgent.load(tmp_path / "agent")
+    assert type(loaded) is SkillGraphAgent
+    assert [option.id for option in loaded.options] == [option.id for option in trained.options]
+    assert [event.id for event in loaded.events] == [event.id for event in trained.events]
+    assert sorted(loaded.graph.nx.edges(data="weight")) == sorted(trained.graph.nx.edges(data="weight"))
+    for id, item in loaded.graph.nx.nodes(data="item"):
+        assert item is (loaded.graph.events[id] if isinstance(item, SalientEvent) else loaded.options[id])
+    for i in range(16):
+        obs = {key: value[i] for key, value in observations().items()}
+        assert loaded.plan(obs) == trained.plan(obs)
+
+
+def test_saving_changes_nothing(trained: SkillGraphAgent, tmp_path: Path) -> None:
+    before = state_of(trained)
+    trained.save(tmp_path / "agent")
+    trained.save_replay_buffer(tmp_path / "replay")
+    assert differences(before, state_of(trained)) == []
+
+
+def test_an_agent_that_never_learned(tmp_path: Path) -> None:
+    agent = new_agent()
+    agent.save(tmp_path / "agent")
+    agent.save_replay_buffer(tmp_path / "replay")
+    loaded = SkillGraphAgent.load(tmp_path / "agent", env=gym.make(TOY))
+    loaded.load_replay_buffer(tmp_path / "replay")
+    assert differences(agent.predict(observations()), loaded.predict(observations())) == []
+    assert loaded.learn(250).num_timesteps == 250
+
+
+def test_loading_without_env_then_set_env(trained_files: tuple[Path, Path]) -> None:
+    agent = SkillGraphAgent.load(trained_files[0])
+    assert agent.get_env() is None
+    agent.set_env(gym.make(TOY))
+    agent.learn(100, reset_num_timesteps=False)
+    assert agent.num_timesteps == 1600
+
+
+def test_loading_does_not_need_the_replay_buffer(trained_files: tuple[Path, Path]) -> None:
+    agent = SkillGraphAgent.load(trained_files[0], env=gym.make(TOY))
+    agent.learn(300, reset_num_timesteps=False)
+    assert agent.store.total == 300
+
+
+def test_learning_on_without_the_counters(trained_files: tuple[Path, Path]) -> None:
+    agent = SkillGraphAgent.load(trained_files[0], env=gym.make(TOY)).learn(50)
+    assert agent.num_timesteps == 50
+
+
+def test_loading_draws_from_no_generator_it_does_not_restore(trained_files: tuple[Path, Path]) -> None:
+    first, second = (SkillGraphAgent.load(trained_files[0], env=gym.make(TOY)) for _ in range(2))
+    assert differences(state_of(first), state_of(second)) == []
+
+
+# -- arguments --------------------------------------------------------------------------------------------------------
+
+
+def test_excluded_arguments_take_their_defaults(tmp_path: Path) -> None:
+    agent = new_agent(option_timeout=33, gamma=0.5)
+    agent.save(tmp_path / "without", exclude=["option_timeout", "gamma"], include=["gamma"])
+    loaded = SkillGraphAgent.load(tmp_path / "without")
+    assert (loaded.controller.timeout, loaded.gamma) == (200, 0.5)
+
+
+@pytest.mark.parametrize("how", ["custom_objects", "kwargs"])
+def test_arguments_given_at_loading_win(trained_files: tuple[Path, Path], how: str) -> None:
+    changes = dict(learning_rate=7e-5, option_timeout=44)
+    arguments: dict[str, Any] = {"custom_objects": changes} if how == "custom_objects" else changes
+    agent = SkillGraphAgent.load(trained_files[0], **arguments)
+    assert agent.controller.timeout == 44
+    assert agent.learning_rate == 7e-5
+    assert agent.global_option.learner.actor_learning_rate == 7e-5
+
+
+def double_view(observation: np.ndarray, achieved_goal: np.ndarray, goal: np.ndarray) -> np.ndarray:
+    return np.concatenate([observation, achieved_goal, goal], axis=1)
+
+
+def test_a_function_must_be_given_again(tmp_path: Path) -> None:
+    agent = new_agent(option_view=double_view).learn(250)
+    agent.save(tmp_path / "agent")
+    with pytest.raises(ValueError, match="option_view=double_view"):
+        SkillGraphAgent.load(tmp_path / "agent")
+    loaded = SkillGraphAgent.load(tmp_path / "agent", option_view=double_view)
+    assert differences(agent.predict(observations()), loaded.predict(observations())) == []
+
+
+@pytest.mark.parametrize("n_envs", [1, 2])
+@pytest.mark.parametrize("noise_class", [NormalActionNoise, OrnsteinUhlenbeckActionNoise])
+def test_noise_is_saved(tmp_path: Path, noise_class: type, n_envs: int) -> None:
+    agent = new_agent(new_vec_env(n_envs=n_envs), action_noise=noise_class(np.zeros(2), 0.3 * np.ones(2))).learn(20)
+    agent.save(tmp_path / "agent")
+    loaded = SkillGraphAgent.load(tmp_path / "agent", env=new_vec_env(n_envs=n_envs)).learn(20)
+    noise = loaded.action_noise.base_noise if isinstance(loaded.action_noise, VectorizedActionNoise) else loaded.action_noise
+    assert type(noise) is noise_class
+
+
+def test_networks_of_other_shapes_are_saved(tmp_path: Path) -> None:
+    policy_kwargs = dict(net_arch=dict(pi=[8], qf=[12, 4]), activation_fn=th.nn.Tanh, optimizer_kwargs=dict(eps=1e-5))
+    agent = new_agent(policy_kwargs=policy_kwargs, option_class=SAC, option_kwargs=dict(ent_coef=0.1)).learn(250)
+    agent.save(tmp_path / "agent")
+    loaded = SkillGraphAgent.load(tmp_path / "agent")
+    assert isinstance(loaded.global_option.learner, SAC)
+    assert differences(agent.predict(observations()), loaded.predict(observations())) == []
+
+
+def test_arguments_are_left_as_they_were_given() -> None:
+    policy_kwargs = dict(net_arch=[8])
+    agent = SkillGraphAgent("MultiInputPolicy", gym.make(TOY), policy_kwargs=policy_kwargs, option_class=SAC)
+    assert agent.options == []
+    assert policy_kwargs == dict(net_arch=[8])
+
+
+# -- parameters -------------------------------------------------------------------------------------------------------
+
+
+def test_parameters_round_trip(trained: SkillGraphAgent) -> None:
+    expected = flat(trained.get_parameters())
+    given = {
+        name: {key: value.clone() + 1.0 if isinstance(value, th.Tensor) else value for key, value in state.items()}
+        for name, state in trained.get_parameters().items()
+    }
+    before, _ = trained.predict(observations())
+    original = SkillGraphAgent.load(as_file(trained)).get_parameters()
+    trained.set_parameters(given)
+    assert not np.array_equal(before, trained.predict(observations())[0])
+    trained.set_parameters(original)
+    assert differences(expected, flat(trained.get_parameters())) == []
+    assert np.array_equal(before, trained.predict(observations())[0])
+
+
+def as_file(agent: SkillGraphAgent) -> io.BytesIO:
+    file = io.BytesIO()
+    agent.save(file)
+    return file
+
+
+def test_parameters_have_sb3_names_and_grow_with_the_options(trained: SkillGraphAgent) -> None:
+    names = set(trained.get_parameters())
+    assert {"policy", "actor.optimizer", "critic.optimizer"} <= names
+    per_option = {name.split(".")[1] for name in names if name.startswith("options.")}
+    assert per_option == {option.id for option in trained.options}
+    assert set(new_agent().get_parameters()) < names
+
+
+def test_parameters_from_a_file(trained: SkillGraphAgent, trained_files: tuple[Path, Path]) -> None:
+    expected = flat(trained.get_parameters())
+    n_options = len(trained.options)
+    trained.learn(60, reset_num_timesteps=False)
+    assert len(trained.options) == n_options, "choose a shorter call: the file's parameters must still fit"
+    assert differences(expected, flat(trained.get_parameters())) != []
+    trained.set_parameters(str(trained_files[0]))
+    assert differences(expected, flat(trained.get_parameters())) == []
+
+
+def test_wrong_parameters_are_refused(trained: SkillGraphAgent, trained_files: tuple[Path, Path]) -> None:
+    parameters = SkillGraphAgent.load(trained_files[0]).get_parameters()
+    policy = dict(parameters["policy"])
+    with pytest.raises(ValueError, match=r"options\.o999"):
+        trained.set_parameters({**parameters, "options.o999.learner.policy": policy})
+    with pytest.raises(ValueError, match="nonsense"):
+        trained.set_parameters({"nonsense": policy}, exact_match=False)
+    with pytest.raises(ValueError, match="missing"):
+        trained.set_parameters({"policy": policy})
+    policy.pop(next(iter(policy)))
+    with pytest.raises(RuntimeError, match="Missing key"):
+        trained.set_parameters({**parameters, "policy": policy})
+    trained.set_parameters({"policy": policy}, exact_match=False)
+
+
+def test_a_file_with_more_options_is_refused_as_parameters(trained_files: tuple[Path, Path]) -> None:
+    agent = new_agent()
+    before = flat(agent.get_parameters())
+    with pytest.raises(ValueError, match=r"options\.o1"):
+        agent.set_parameters(str(trained_files[0]))
+    assert differences(before, flat(agent.get_parameters())) == []
+    agent.set_parameters({"policy": SkillGraphAgent.load(trained_files[0]).get_parameters()["policy"]}, exact_match=False)
+
+
+# -- replay buffer ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["replay", "replay.pkl", "replay.zip"])
+def test_replay_buffer_round_trip(trained: SkillGraphAgent, tmp_path: Path, name: str) -> None:
+    expected = state_of(trained)
+    trained.save_replay_buffer(str(tmp_path / name))
+    trained.learn(100, reset_num_timesteps=False)
+    trained.load_replay_buffer(tmp_path / name)
+    assert differences(expected["replay"]["store"], state_of(trained)["replay"]["store"]) == []
+
+
+def test_only_filled_rows_are_saved(tmp_path: Path) -> None:
+    agent = new_agent(buffer_size=10**6).learn(100)
+    agent.save_replay_buffer(tmp_path / "replay.zip")
+    assert (tmp_path / "replay.zip").stat().st_size < 30_000
+
+
+def test_a_full_buffer_is_saved_and_goes_on(tmp_path: Path) -> None:
+    agent = new_agent(buffer_size=150).learn(420)
+    agent.save(tmp_path / "agent")
+    agent.save_replay_buffer(tmp_path / "replay")
+    expected = state_of(agent.learn(301, reset_num_timesteps=False))
+    loaded = SkillGraphAgent.load(tmp_path / "agent", env=gym.make(TOY))
+    loaded.load_replay_buffer(tmp_path / "replay")
+    loaded.learn(301, reset_num_timesteps=False)
+    assert differences(expected["replay"], state_of(loaded)["replay"]) == []
+
+
+@pytest.mark.parametrize(("kwargs", "n_envs"), [(dict(buffer_size=500), 1), (dict(), 2)])
+def test_replay_buffer_of_another_size_is_refused(
+    trained_files: tuple[Path, Path], kwargs: dict[str, Any], n_envs: int
+) -> None:
+    agent = new_agent(new_vec_env(n_envs=n_envs), **kwargs).learn(100)
+    before = state_of(agent)
+    with pytest.raises(ValueError, match="buffer_size" if kwargs else "n_envs"):
+        agent.load_replay_buffer(trained_files[1])
+    assert differences(before, state_of(agent)) == []
+
+
+def test_nothing_is_left_open(tmp_path: Path) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", ResourceWarning)
+        agent = new_agent().learn(100)
+        agent.save(tmp_path / "agent")
+        agent.save_replay_buffer(tmp_path / "replay")
+        loaded = SkillGraphAgent.load(tmp_path / "agent")
+        loaded.load_replay_buffer(tmp_path / "replay")
+        loaded.set_parameters(tmp_path / "agent")
+        del agent, loaded
+
+
+def test_what_is_in_a_file_is_all_there(trained_files: tuple[Path, Path]) -> None:
+    state = state_in(*trained_files)
+    assert set(state["agent"]["parameters"]) >= {"policy", "actor.optimizer", "critic.optimizer"}
+    assert len(state["replay"]["store"]["columns"]["action"]) == 1500

@@ -1,0 +1,421 @@
+"""SB3's own acceptance tests, re-expressed for SkillGraphAgent: it behaves as any SB3 algorithm does."""
+
+import csv
+import warnings
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from conftest import (
+    EAGER,
+    POINT,
+    TOY,
+    Recorder,
+    check_store,
+    differences,
+    in_new_process,
+    new_agent,
+    new_vec_env,
+    state_in,
+    state_of,
+    without_clock,
+)
+from stable_baselines3 import TD3
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import (
+    BaseCallback,
+    CallbackList,
+    CheckpointCallback,
+    EvalCallback,
+    EveryNTimesteps,
+    LogEveryNTimesteps,
+    StopTrainingOnMaxEpisodes,
+    StopTrainingOnNoModelImprovement,
+    StopTrainingOnRewardThreshold,
+)
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.logger import configure
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
+
+from sb3_skillgraph import SkillGraphAgent
+
+
+class Counting(BaseCallback):
+    """Counts what is called, and looks at what a callback is shown; may stop."""
+
+    def __init__(self, stop_at: int | None = None) -> None:
+        super().__init__()
+        self.stop_at = stop_at
+        self.calls: list[str] = []
+
+    def _on_training_start(self) -> None:
+        assert {"total_timesteps", "tb_log_name"} <= set(self.locals)
+        self.calls.append("training_start")
+
+    def _on_rollout_start(self) -> None:
+        self.calls.append("rollout_start")
+
+    def _on_step(self) -> bool:
+        assert {"new_obs", "dones", "rewards", "infos", "actions"} <= set(self.locals)
+        assert len(self.locals["dones"]) == self.model.n_envs
+        assert self.training_env is self.model.get_env()
+        self.calls.append("step")
+        return self.n_calls != self.stop_at
+
+    def _on_rollout_end(self) -> None:
+        self.calls.append("rollout_end")
+
+    def _on_training_end(self) -> None:
+        self.calls.append("training_end")
+
+
+def one_observation(goal: tuple[float, float] = (1.0, 1.0)) -> dict[str, np.ndarray]:
+    return {"observation": np.array([-1.0, 1.0]), "achieved_goal": np.array([-1.0, 1.0]), "desired_goal": np.array(goal)}
+
+
+def batch(n: int) -> dict[str, np.ndarray]:
+    points = np.random.default_rng(0).uniform(-1.5, 1.5, (2, n, 2))
+    return {"observation": points[0], "achieved_goal": points[0], "desired_goal": points[1]}
+
+
+# -- what any algorithm has -------------------------------------------------------------------------------------------
+
+
+def test_is_an_off_policy_algorithm() -> None:
+    agent = SkillGraphAgent("MultiInputPolicy", TOY, seed=0)
+    assert isinstance(agent, OffPolicyAlgorithm)
+    assert agent.learn(20) is agent
+    assert agent.num_timesteps == 20
+    assert isinstance(agent.get_env(), VecEnv)
+    assert agent.get_vec_normalize_env() is None
+    assert agent.policy is agent.global_option.learner.policy
+    assert (agent.n_envs, agent.seed, agent.verbose) == (1, 0, 0)
+
+
+def test_constructor_takes_sb3_arguments_in_sb3_order() -> None:
+    def names(cls: type[BaseAlgorithm]) -> list[str]:
+        return list(cls.__init__.__code__.co_varnames[1 : cls.__init__.__code__.co_argcount])
+
+    theirs = [name for name in names(TD3) if name not in ("policy_delay", "target_policy_noise", "target_noise_clip")]
+    assert names(SkillGraphAgent) == theirs
+
+
+def test_learn_counts_steps_as_sb3_does() -> None:
+    agent = new_agent(new_vec_env(n_envs=2)).learn(31)
+    assert agent.num_timesteps == 32
+    agent.learn(10)
+    assert agent.num_timesteps == 10
+    agent.learn(10, reset_num_timesteps=False)
+    assert agent.num_timesteps == 20
+    assert agent.store.total == 52
+
+
+# -- vectorised environments ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("monitored", [False, True])
+@pytest.mark.parametrize("n_envs", [1, 2, 3])
+def test_vectorised_environments(n_envs: int, monitored: bool) -> None:
+    recorders = [Recorder(gym.make(TOY, max_steps=40)) for _ in range(n_envs)]
+    envs = [Monitor(env) if monitored else env for env in recorders]
+    agent = new_agent(DummyVecEnv([lambda env=env: env for env in envs])).learn(420)
+    assert agent.num_timesteps == agent.store.total == 420
+    for i, recorder in enumerate(recorders):
+        check_store(agent, recorder.transitions, i)
+    assert agent._episode_num == n_envs * (420 // n_envs // 40)
+    assert agent.predict(agent.env.reset())[0].shape == (n_envs, 2)
+
+
+def test_worker_processes_give_the_same_as_one_process() -> None:
+    expected = without_clock(state_of(new_agent(new_vec_env()).learn(500)))
+    env = new_vec_env(vec_env_cls=SubprocVecEnv)
+    try:
+        agent = new_agent(env).learn(500)
+        assert differences(expected, without_clock(state_of(agent))) == []
+        rrt = new_agent(env, salience="rrt", learning_starts=50).learn(300)
+        assert rrt.num_timesteps == 300
+    finally:
+        env.close()
+
+
+@pytest.mark.mujoco
+def test_on_a_simulator(tmp_path: Path) -> None:
+    agent = new_agent(new_vec_env(POINT, max_steps=100)).learn(400)
+    assert agent.store.total == 400
+    agent.save(tmp_path / "agent")
+    loaded = SkillGraphAgent.load(tmp_path / "agent")
+    obs = agent.env.reset()
+    np.testing.assert_array_equal(loaded.predict(obs)[0], agent.predict(obs)[0])
+    assert evaluate_policy(agent, agent.env, n_eval_episodes=2)[0] >= 0.0
+
+
+def test_set_env(trained: SkillGraphAgent) -> None:
+    env = Recorder(gym.make(TOY))
+    total, n_steps = trained.store.total, trained.num_timesteps
+    trained.learn(30, reset_num_timesteps=False)
+    trained.set_env(env)
+    trained.learn(30, reset_num_timesteps=False)
+    assert trained.store.total == total + 60
+    assert trained.num_timesteps == n_steps + 60
+    assert len(env.starts) == 1
+    assert len(env.transitions) == 30
+
+
+def test_set_env_with_another_number_of_environments(trained: SkillGraphAgent) -> None:
+    with pytest.raises((AssertionError, ValueError), match="number of environments"):
+        trained.set_env(new_vec_env(n_envs=2))
+
+
+# -- predict ----------------------------------------------------------------------------------------------------------
+
+
+def test_predict_one_observation_or_a_batch(trained: SkillGraphAgent) -> None:
+    action, state = trained.predict(one_observation())
+    assert action.shape == (2,)
+    assert trained.action_space.contains(action)
+    assert all(array.shape == (1,) for array in state)
+    actions, states = trained.predict(batch(7))
+    assert actions.shape == (7, 2)
+    assert all(array.shape == (7,) for array in states)
+    for i in range(7):
+        single, _ = trained.predict({key: value[i] for key, value in batch(7).items()})
+        np.testing.assert_allclose(single, actions[i], atol=1e-6)
+
+
+def test_predict_keeps_its_state_outside_and_forgets_it_at_an_episode_start(trained: SkillGraphAgent) -> None:
+    observations = batch(5)
+    first, state = trained.predict(observations)
+    kept = tuple(array.copy() for array in state)
+    start = np.zeros(5, dtype=bool)
+    second, later = trained.predict(observations, state=state, episode_start=start)
+    assert differences(kept, state) == []  # what was passed in is not written to
+    assert not np.array_equal(state[1], later[1])  # steps the options have run
+    again, fresh = trained.predict(observations, state=later, episode_start=~start)
+    assert differences((first, kept), (again, fresh)) == []
+    mixed = np.array([True, False, False, True, False])
+    _, state = trained.predict(observations, state=later, episode_start=mixed)
+    _, running = trained.predict(observations, state=later, episode_start=start)
+    for got, new, old in zip(state, kept, running, strict=True):
+        np.testing.assert_array_equal(got, np.where(mixed, new, old))
+    assert second.shape == first.shape
+
+
+def test_predict_is_deterministic_and_changes_nothing(trained: SkillGraphAgent) -> None:
+    before = state_of(trained)
+    results = [trained.predict(batch(40), deterministic=flag) for flag in (True, False, True)]
+    assert differences(results[0], results[1]) == []
+    assert differences(results[0], results[2]) == []
+    state = results[0][1]
+    for _ in range(30):
+        _, state = trained.predict(batch(40), state=state, episode_start=np.zeros(40, dtype=bool))
+    assert differences(before, state_of(trained)) == []
+
+
+@pytest.mark.parametrize("n_envs", [1, 2])
+def test_evaluate_policy(trained: SkillGraphAgent, n_envs: int) -> None:
+    before = state_of(trained)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        env = new_vec_env(n_envs=n_envs, terminate_on_success=True)
+        rewards, lengths = evaluate_policy(trained, env, n_eval_episodes=6, return_episode_rewards=True)
+    assert len(rewards) == len(lengths) == 6
+    assert max(rewards) == 1.0
+    assert differences(before, state_of(trained)) == []
+
+
+# -- callbacks --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("n_envs", [1, 2])
+def test_callbacks_see_every_step(n_envs: int) -> None:
+    callback = Counting()
+    agent = new_agent(new_vec_env(n_envs=n_envs)).learn(260, callback=callback)
+    assert callback.n_calls * n_envs == callback.num_timesteps == agent.num_timesteps == 260
+    assert callback.calls.count("step") == 260 // n_envs
+    assert callback.calls.count("rollout_start") == callback.calls.count("rollout_end") == 260 // n_envs
+    assert (callback.calls[0], callback.calls[-1]) == ("training_start", "training_end")
+
+
+@pytest.mark.parametrize("stop_at", [1, 40, 41, 263])
+def test_a_callback_that_stops_leaves_no_trace_of_its_step(stop_at: int) -> None:
+    env = Recorder(gym.make(TOY, max_steps=40))
+    agent = new_agent(env)
+    agent.learn(500, callback=Counting(stop_at))
+    assert agent.num_timesteps == stop_at
+    assert agent.store.total == stop_at - 1
+    stopped = env.transitions.pop()
+    check_store(agent, env.transitions)
+    # Apart from the counter and the environment, the agent is one that was told to learn a step less.
+    ours = state_of(agent)["agent"]
+    if stop_at > 1:
+        theirs = state_of(new_agent(gym.make(TOY, max_steps=40)).learn(stop_at - 1))["agent"]
+        for name in ("options", "parameters", "graph", "chaining", "discovery", "visited"):
+            assert differences(theirs[name], ours[name]) == [], name
+        assert differences(theirs["progress"]["rng"], ours["progress"]["rng"]) == []
+    n_starts = len(env.starts)
+    agent.learn(100, reset_num_timesteps=False)
+    assert agent.num_timesteps == stop_at + 100
+    np.testing.assert_array_equal(env.transitions[stop_at - 1]["achieved_goal"], env.starts[n_starts])
+    assert not np.array_equal(stopped["next_achieved_goal"], env.starts[n_starts])
+    check_store(agent, env.transitions)
+
+
+def test_the_stock_callbacks(tmp_path: Path) -> None:
+    event_callback = Counting()
+    eval_callback = EvalCallback(
+        new_vec_env(n_envs=1, terminate_on_success=True),
+        callback_on_new_best=StopTrainingOnRewardThreshold(reward_threshold=2.0),
+        callback_after_eval=StopTrainingOnNoModelImprovement(max_no_improvement_evals=100),
+        eval_freq=150,
+        n_eval_episodes=2,
+        best_model_save_path=str(tmp_path / "best"),
+        log_path=str(tmp_path / "evaluations"),
+        warn=False,
+    )
+    checkpoint = CheckpointCallback(150, str(tmp_path / "checkpoints"), "dsg", save_replay_buffer=True)
+    every = EveryNTimesteps(n_steps=100, callback=event_callback)
+    callback = CallbackList([eval_callback, checkpoint, every, LogEveryNTimesteps(120)])
+    agent = new_agent(new_vec_env(n_envs=1)).learn(500, callback=callback, progress_bar=True)
+    assert agent.num_timesteps == 500
+    assert event_callback.n_calls == 5
+    assert len(np.load(tmp_path / "evaluations" / "evaluations.npz")["successes"]) == 3
+    SkillGraphAgent.load(tmp_path / "best" / "best_model")
+    names = sorted(path.name for path in (tmp_path / "checkpoints").iterdir())
+    assert names == sorted(
+        name for n in (150, 300, 450) for name in (f"dsg_{n}_steps.zip", f"dsg_replay_buffer_{n}_steps.pkl")
+    )
+    resumed = SkillGraphAgent.load(tmp_path / "checkpoints" / "dsg_300_steps", env=gym.make(TOY))
+    resumed.load_replay_buffer(tmp_path / "checkpoints" / "dsg_replay_buffer_300_steps.pkl")
+    assert resumed.num_timesteps == 300
+    assert resumed.store.total == 299  # a checkpoint is taken between a step and its storing
+    resumed.learn(100, reset_num_timesteps=False)
+    assert resumed.num_timesteps == 400
+    assert resumed.store.total == 399
+
+
+def test_stopping_on_episodes_and_on_reward() -> None:
+    agent = new_agent(new_vec_env(n_envs=1, max_steps=30))
+    agent.learn(1000, callback=StopTrainingOnMaxEpisodes(max_episodes=4))
+    assert agent.num_timesteps == 120
+    stop = StopTrainingOnRewardThreshold(reward_threshold=-1.0)
+    eval_callback = EvalCallback(new_vec_env(n_envs=1), callback_on_new_best=stop, eval_freq=50, n_eval_episodes=1)
+    agent.learn(1000, callback=eval_callback)
+    assert agent.num_timesteps == 50
+
+
+@pytest.mark.parametrize("n_envs", [1, 2])
+def test_evaluation_in_the_middle_leaves_training_alone(tmp_path: Path, n_envs: int) -> None:
+    expected = without_clock(state_of(new_agent(new_vec_env(n_envs=n_envs)).learn(600)))
+    eval_env = new_vec_env(n_envs=n_envs)
+    callback = CallbackList(
+        [
+            EvalCallback(eval_env, eval_freq=70, n_eval_episodes=2, best_model_save_path=str(tmp_path), verbose=0),
+            CheckpointCallback(90, str(tmp_path), save_replay_buffer=True),
+        ]
+    )
+    agent = new_agent(new_vec_env(n_envs=n_envs)).learn(600, callback=callback)
+    assert differences(expected, without_clock(state_of(agent))) == []
+
+
+# -- the same again ---------------------------------------------------------------------------------------------------
+
+AGAIN = """
+import sys
+import torch
+torch.set_num_threads(3)
+import sb3_skillgraph
+assert torch.get_num_threads() == 3, "importing the library must not set threads"
+from conftest import new_agent
+agent = new_agent().learn(900)
+agent.save(sys.argv[1])
+agent.save_replay_buffer(sys.argv[2])
+"""
+
+
+def test_the_same_seed_gives_the_same_agent(tmp_path: Path) -> None:
+    first, second = (without_clock(state_of(new_agent().learn(900))) for _ in range(2))
+    assert differences(first, second) == []
+    in_new_process(AGAIN, tmp_path / "agent.zip", tmp_path / "replay.zip", hash_seed=77)
+    assert differences(first, without_clock(state_in(tmp_path / "agent.zip", tmp_path / "replay.zip"))) == []
+    assert len(first["agent"]["graph"]["edges"]) > 2
+    other = without_clock(state_of(new_agent(seed=1).learn(900)))
+    assert differences(first["agent"]["graph"], other["agent"]["graph"]) != []
+
+
+def test_without_a_seed_agents_differ() -> None:
+    first, second = (new_agent(seed=None) for _ in range(2))
+    assert not np.array_equal(first.predict(one_observation())[0], second.predict(one_observation())[0])
+
+
+# -- logging ----------------------------------------------------------------------------------------------------------
+
+KEYS = {
+    *("rollout/ep_rew_mean", "rollout/ep_len_mean", "rollout/success_rate"),
+    *("train/actor_loss", "train/critic_loss", "train/learning_rate", "train/n_updates"),
+    *("skillgraph/events", "skillgraph/options", "skillgraph/edges", "skillgraph/joined_pairs", "skillgraph/coverage"),
+}
+TABLE_KEYS = {"time/episodes", "time/fps", "time/time_elapsed", "time/total_timesteps"}
+
+
+def test_csv_log(tmp_path: Path) -> None:
+    agent = new_agent()
+    agent.set_logger(configure(str(tmp_path), ["csv"]))
+    agent.learn(1000, log_interval=2)
+    with open(tmp_path / "progress.csv", newline="") as file:
+        entries = list(csv.DictReader(file))
+    assert set(entries[-1]) >= KEYS | TABLE_KEYS
+    assert [int(entry["time/total_timesteps"]) for entry in entries] == list(range(200, 1001, 200))
+    last = {key: float(value) for key, value in entries[-1].items()}
+    assert last["skillgraph/events"] == len(agent.events)
+    assert last["skillgraph/edges"] > 0
+    assert last["rollout/ep_len_mean"] == 100
+    for name in ("joined_pairs", "coverage"):
+        assert 0.0 < last[f"skillgraph/{name}"] <= 1.0
+    assert last["train/n_updates"] == 799  # an entry is written before the updates of its step
+
+
+def test_tensorboard_log(tmp_path: Path) -> None:
+    event_accumulator = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
+    agent = new_agent(tensorboard_log=str(tmp_path)).learn(300, log_interval=1)
+    agent.learn(100, reset_num_timesteps=False)
+    agent.learn(100, tb_log_name="other")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["SkillGraph_1", "other_1"]
+    accumulator = event_accumulator.EventAccumulator(str(tmp_path / "SkillGraph_1"))
+    accumulator.Reload()
+    tags = set(accumulator.Tags()["scalars"])
+    assert (KEYS - {"train/n_updates"}) <= tags
+    assert [event.step for event in accumulator.Scalars("skillgraph/events")][:3] == [100, 200, 300]
+
+
+def test_table_and_silence(capsys: pytest.CaptureFixture[str]) -> None:
+    SkillGraphAgent("MultiInputPolicy", gym.make(TOY), **{**EAGER, "verbose": 0}).learn(250, log_interval=1)
+    assert capsys.readouterr().out == ""
+    SkillGraphAgent("MultiInputPolicy", gym.make(TOY), **{**EAGER, "verbose": 1}).learn(250, log_interval=1)
+    table = capsys.readouterr().out
+    assert "skillgraph/" in table
+    assert "coverage" in table
+
+
+def test_nothing_is_left_open(tmp_path: Path) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", ResourceWarning)
+        agent = new_agent(tensorboard_log=str(tmp_path)).learn(120, log_interval=1)
+        agent.logger.close()
+        agent.env.close()
+        del agent
+
+
+def test_what_is_learned_is_no_secret(trained: SkillGraphAgent) -> None:
+    """The attributes users are promised."""
+    assert [event.id for event in trained.events] == [f"e{i}" for i in range(len(trained.events))]
+    option = trained.options[0]
+    assert trained.options["o1"] is trained.options.o1 is option
+    nodes: dict[str, Any] = dict(trained.graph.nx.nodes(data="item"))
+    assert set(nodes) == {event.id for event in trained.events} | {o.id for o in trained.options if o.mature}
+    for _, _, attributes in trained.graph.nx.edges(data=True):
+        assert attributes["weight"] >= 0.0
+        assert 0.0 < attributes["success_rate"] <= 1.0
