@@ -39,6 +39,8 @@ PAPER: dict[str, Any] = dict(
     events_per_attempt=2,
     event_tries=1,
     max_unconnected=None,
+    gestation_period=3,
+    practice_runs=0,
     target_choice="uniform",
     max_failures=None,
     link_reach=0,
@@ -95,6 +97,7 @@ class SkillGraphAgent(Assembly):
     :param event_radius: radius of salient events, in goal units; None takes the environment's ``success_radius`` or
         ``distance_threshold``
     :param gestation_period: successes after which an option is mature
+    :param practice_runs: successful runs of its own that an option needs before its chain counts as complete
     :param warm_start: gestating options act with the global option's policy and copy it when they mature; False lets
         them learn from scratch
     :param global_update_fraction: share of the updates that goes to the global option; executed options share the rest
@@ -162,7 +165,8 @@ class SkillGraphAgent(Assembly):
         option_view: str | View | None = None,
         option_timeout: int = 200,
         event_radius: float | None = None,
-        gestation_period: int = 3,
+        gestation_period: int = 1,
+        practice_runs: int = 2,
         warm_start: bool = True,
         global_update_fraction: float = 0.5,
         hindsight: float = 0.8,

@@ -103,7 +103,7 @@ class Assembly(Persistence):
         self.visited = VisitedStates(self._spec.goal_dim, 0.25 * self.event_radius, self.n_envs)
         self.planner = GraphPlanner(self.graph, self.visited, self.event_radius, args["event_reach"], args["nearest"])
         self.chaining = DeepSkillChaining(
-            self.graph, self._make_option, self._matured, args["gestation_period"], args["max_failures"]
+            self.graph, self._make_option, self._matured, args["gestation_period"], args["practice_runs"], args["max_failures"]
         )
         self.controller = Controller(
             self.global_option,

@@ -22,7 +22,9 @@ class SkillChain:
     :param target: id of the event it leads to
     :param options: ids of its options: the first (the root) ends in the target event, each next one in the initiation
         set of the one before
-    :param complete: whether its last option can be started from the source event
+    :param joins: whether it is the chain that joins a new event to the graph
+    :param complete: whether one of its options can be started from the source event and has shown often enough that it
+        reaches its target
     :param n_failures: timed-out runs since the last success
     :param dropped: whether it has been given up as hopeless
     """
@@ -31,6 +33,7 @@ class SkillChain:
     source: str
     target: str
     options: list[str] = field(default_factory=list)
+    joins: bool = False
     complete: bool = False
     n_failures: int = 0
     dropped: bool = False
@@ -48,6 +51,7 @@ class DeepSkillChaining:
     :param make_option: makes a gestating option for a target id and a termination set
     :param on_maturity: called with an option the moment it matures (it then takes over the global policy)
     :param gestation_period: successes an option needs to mature
+    :param practice_runs: successful runs of its own that an option needs before its chain is complete
     :param max_failures: timed-out runs in a row after which a chain is given up; None for never
     """
 
@@ -57,27 +61,30 @@ class DeepSkillChaining:
         make_option: MakeOption,
         on_maturity: Callable[[Option], None],
         gestation_period: int,
+        practice_runs: int,
         max_failures: int | None,
     ) -> None:
         self.graph = graph
         self.make_option = make_option
         self.on_maturity = on_maturity
         self.gestation_period = gestation_period
+        self.practice_runs = practice_runs
         self.max_failures = max_failures
         self.chains: dict[str, SkillChain] = {}
         self.options: dict[str, Option] = {}
         self.chain_of: dict[str, SkillChain] = {}
 
-    def open_chain(self, source: SalientEvent, target: SalientEvent) -> SkillChain:
+    def open_chain(self, source: SalientEvent, target: SalientEvent, joins: bool = False) -> SkillChain:
         """Start (or take up again) the chain between two events.
 
         :param source: where it must be possible to start
         :param target: where it must lead
+        :param joins: whether it is to join a new event to the graph
         :return: the chain
         """
         id = f"{source.id}>{target.id}"
         if id not in self.chains:
-            chain = self.chains[id] = SkillChain(id, source.id, target.id)
+            chain = self.chains[id] = SkillChain(id, source.id, target.id, joins=joins)
             self._grow(chain, target.id, target)
         chain = self.chains[id]
         if chain.dropped:
@@ -154,12 +161,17 @@ class DeepSkillChaining:
     def _check(self, chain: SkillChain, source: SalientEvent) -> None:
         """Close a chain whose last option can be started from the source, or grow it by a child that leads there."""
         last = self.options[chain.options[-1]]
-        chain.complete = any(self.graph.nx.has_edge(source.id, id) for id in chain.options)
-        if chain.complete or not last.mature:
+        startable = [self.options[id] for id in chain.options if self.graph.nx.has_edge(source.id, id)]
+        chain.complete = any(sum(option.record) >= self.practice_runs for option in startable)
+        if startable or not last.mature:
             return
         tried = self.graph.evidence.get((source.id, last.id), ())
         if not tried or (len(tried) >= self.gestation_period and sum(tried) * 2 < len(tried)):
             self._grow(chain, last.id, last)
+
+    def unsettled(self) -> set[str]:
+        """Return the ids of the events whose joining is still being practised."""
+        return {chain.target for chain in self.chains.values() if chain.joins and chain.open}
 
     def get_state(self) -> dict[str, Any]:
         """Return chains and the order of the options as plain data."""

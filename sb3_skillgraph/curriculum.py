@@ -15,7 +15,7 @@ from sb3_skillgraph.salience.discovery import EventDiscovery
 from sb3_skillgraph.visited import VisitedStates
 
 N_EXPLORED = 10  # candidates for an exploration
-JOINED_ALREADY = 3.0  # option runs the agent walks further to practise a chain to an event that is not joined yet
+JOINED_ALREADY = 3.0  # option runs the agent goes further to practise a chain that joins a new event
 
 
 class Strategy(NamedTuple):
@@ -231,11 +231,16 @@ class Curriculum:
     def _crossed(self, env: int, source: SalientEvent, target: SalientEvent, end: np.ndarray) -> None:
         path = np.stack(self._since_event[env])
         chain = self.chaining.chains.get(f"{source.id}>{target.id}")
-        if chain is None:
-            if len(path) <= self.strategy.link_reach and self._detour(source, target):
-                self.chaining.open_chain(source, target)
-        elif self.strategy.off_policy_runs and not self.chaining.options[chain.options[0]].mature:
-            self.chaining.learn_success(self.chaining.options[chain.options[0]], path, end, own=False)
+        if chain is None and len(path) <= self.strategy.link_reach and self._detour(source, target):
+            chain = self.chaining.open_chain(source, target)
+        if chain is not None and self.strategy.off_policy_runs:
+            self._credit(chain, path, end)
+
+    def _credit(self, chain: SkillChain, path: np.ndarray, end: np.ndarray) -> None:
+        """Show a chain's gestating root a way that something else took."""
+        root = self.chaining.options[chain.options[0]]
+        if not root.mature:
+            self.chaining.learn_success(root, path, end, own=False)
 
     def _detour(self, source: SalientEvent, target: SalientEvent) -> bool:
         """Whether the graph knows no way between two events, or only one by way of others."""
@@ -248,7 +253,7 @@ class Curriculum:
         if self.pinned is not None:
             return self._to_event(point, self.graph.events[self.pinned])
         connected = self.connected()
-        if self.discovery.due(self.n_episodes, connected):
+        if self.discovery.due(self.n_episodes, self.graph.events.keys() - self.chaining.unsettled()):
             for event in self.discovery.attempt(self.n_episodes, self.rng):
                 self._join(event)
         if self.strategy.target_choice == "uniform":
@@ -267,7 +272,11 @@ class Curriculum:
         source = next((v for v, _ in self.planner.vertices_near(event.center) if v.id != event.id), None)
         if source is None:
             source = self.graph.events["e0"]
-        self.chaining.open_chain(source, event)
+        chain = self.chaining.open_chain(source, event, joins=True)
+        if self.strategy.off_policy_runs:
+            path = self.visited.path_from(int(source.id[1:]), event.center, 0.5 * event.radius)
+            if len(path):
+                self._credit(chain, path, event.center)
         if self.strategy.target_choice == "nearest":
             self.chaining.open_chain(event, source)
 
@@ -298,14 +307,13 @@ class Curriculum:
         return self._to_event(point, events[self.rng.integers(len(events))])
 
     def _nearest_chain(self, point: np.ndarray) -> SkillChain | None:
-        """Return the open chain that is cheapest to practise from here; those to events not joined yet come first."""
-        connected = self.connected()
+        """Return the open chain that is cheapest to practise from here; those that join new events come first."""
 
         def cost(chain: SkillChain) -> tuple[float, int]:
             source = self.graph.events[chain.source]
             path = None if source.contains(point[None])[0] else self.planner.path_to(point, chain.source)
             travel = 0.0 if source.contains(point[None])[0] else float("inf") if path is None else path.cost
-            return travel + JOINED_ALREADY * (chain.target in connected), chain.n_failures
+            return travel + (0.0 if chain.joins else JOINED_ALREADY), chain.n_failures
 
         events = self.graph.events
         chains = [c for c in self.chaining.open_chains() if not events[c.target].contains(point[None])[0]]

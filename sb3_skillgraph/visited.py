@@ -208,6 +208,25 @@ class VisitedStates:
         same = arrival // span == departure // span
         return float((arrival - departure)[same].min()) if same.any() else float("inf")
 
+    def path_from(self, event: int, point: np.ndarray, radius: float) -> np.ndarray:
+        """Return the quickest way any trajectory took from an event to near a point.
+
+        :param event: index of the event that was last passed
+        :param point: shape ``(goal_dim,)``
+        :param radius: how near a trajectory must come to the point, in goal units
+        :return: visited points, shape ``(n, goal_dim)``; empty if no trajectory came from there
+        """
+        before, steps, _, _ = self._events_passed()
+        here = self.near(point, radius)
+        here = here[before[here] == event]
+        if len(here) == 0:
+            return np.zeros((0, self.goal_dim))
+        end = here[steps[here].argmin()]
+        n = self.size
+        way = (self._trajectory[:n] == self._trajectory[end]) & (self._step[:n] <= self._step[end])
+        way &= self._step[:n] >= self._step[end] - steps[end]
+        return self.points[np.flatnonzero(way)].astype(np.float64)
+
     def rewind(self, index: int, max_steps: int) -> int:
         """Walk back along a trajectory until at most ``max_steps`` lie behind the last event passed.
 

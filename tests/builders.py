@@ -122,7 +122,12 @@ class World:
         self.made: list[Option] = []
         self.matured: list[str] = []
         self.chaining = DeepSkillChaining(
-            self.graph, self._make, lambda option: self.matured.append(option.id), gestation_period=3, max_failures=4
+            self.graph,
+            self._make,
+            lambda option: self.matured.append(option.id),
+            gestation_period=3,
+            practice_runs=0,
+            max_failures=4,
         )
         self.global_option = make_option("global", None, None, seed=0)
         self.controller = Controller(
@@ -143,7 +148,13 @@ class World:
         return added
 
     def add_option(
-        self, target: SalientEvent, start: Sequence[float], *, start_radius: float = 3.0, successes: int = 8, failures: int = 0
+        self,
+        target: SalientEvent,
+        start: Sequence[float],
+        *,
+        start_radius: float = 3.0,
+        successes: int = 8,
+        failures: int = 0,
     ) -> Option:
         """A mature option from the disc around ``start`` to an event, with effects in the event's centre."""
         index = len(self.chaining.options) + 1

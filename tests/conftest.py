@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 import torch as th
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from sb3_skillgraph import SkillGraphAgent
@@ -130,8 +131,10 @@ def differences(a: Any, b: Any, where: str = "") -> list[str]:
         same = x.dtype == y.dtype and x.shape == y.shape and x.tobytes() == y.tobytes()
     elif isinstance(a, float):
         same = a == b or (a != a and b != b)
+    elif isinstance(a, ActionNoise):
+        return differences(vars(a), vars(b), where)
     else:
-        same = vars(a) == vars(b) if hasattr(a, "__dict__") and not callable(a) else a == b
+        same = a == b
     return [] if same else [f"{where}: {a!r} and {b!r}"[:200]]
 
 

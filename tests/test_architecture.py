@@ -173,7 +173,12 @@ def test_nothing_but_the_command_line_sets_threads(path: Path) -> None:
 
 @pytest.mark.parametrize(
     "source",
-    ["import pickle", "from cloudpickle import loads", "np.load(f, allow_pickle=True)", "th.load(f, weights_only=True)"],
+    [
+        "import pickle",
+        "from cloudpickle import loads",
+        "np.load(f, allow_pickle=True)",
+        "th.load(f, weights_only=True)",
+    ],
 )
 def test_the_pickle_check_itself(source: str) -> None:
     assert unpickling(ast.parse(source))

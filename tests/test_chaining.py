@@ -222,6 +222,32 @@ def test_a_complete_chain_whose_edge_breaks_is_open_again(line: Line) -> None:
     assert not line.chain.complete
 
 
+def test_a_chain_is_practised_until_its_own_runs_have_succeeded(line: Line) -> None:
+    line.chaining.practice_runs = 2
+    root = line.option(0)
+    line.succeed(root, 0.0, 3, own=False)  # others have shown the way
+    assert root.mature
+    assert line.graph.nx.has_edge("e0", "o1")
+    assert line.chain.open
+    line.succeed(root, 0.0)
+    line.fail(root, 0.0)
+    assert line.chain.open
+    line.succeed(root, 0.0)
+    assert line.chain.complete
+    assert line.chain.options == ["o1"]  # it could be started from the source all along: no child
+
+
+def test_unsettled_are_the_events_whose_joining_chain_is_open(line: Line) -> None:
+    assert line.chaining.unsettled() == set()
+    third = line.add_event(20.0, 0.0)
+    joining = line.chaining.open_chain(line.target, third, joins=True)
+    line.chaining.open_chain(third, line.target)
+    assert line.chaining.unsettled() == {"e2"}
+    line.succeed(line.chaining.options[joining.options[0]], 10.0, 3)
+    assert joining.complete
+    assert line.chaining.unsettled() == set()
+
+
 def test_runs_that_begin_in_an_event_are_its_evidence(line: Line) -> None:
     root = line.option(0)
     line.succeed(root, 0.5)
@@ -235,7 +261,7 @@ def test_state_round_trip(line: Line) -> None:
     line.succeed(line.option(0), 7.0, 3)
     line.chaining.open_chain(line.target, line.source)
     line.fail(line.option(1), 0.0, 2)
-    restored = DeepSkillChaining(line.graph, line.chaining.make_option, print, 3, 4)
+    restored = DeepSkillChaining(line.graph, line.chaining.make_option, print, 3, 0, 4)
     restored.set_state(copy.deepcopy(line.chaining.get_state()), line.chaining.options)
     assert restored.chains == line.chaining.chains
     assert list(restored.options) == ["o1", "o2", "o3"]

@@ -231,12 +231,11 @@ def test_adapt_begins_every_episode_at_the_start(trained_files: Any) -> None:
     agent = SkillGraphAgent.load(trained_files[0], env=env)
     start = np.array([1.0, -1.0])
     agent.adapt(np.array([-1.0, -1.0]), start=start, total_timesteps=100)
-    assert len(env.starts) >= 3
-    np.testing.assert_allclose(env.starts[:3], np.tile(start, (3, 1)))
+    for first in (0, 40, 80):
+        np.testing.assert_array_equal(env.transitions[first]["achieved_goal"], start)
     check_store(agent, env.transitions)
-    n_episodes = len(env.starts)
     agent.learn(100, reset_num_timesteps=False)
-    assert not any(np.allclose(point, start) for point in env.starts[n_episodes + 1 :])
+    assert not any(np.allclose(step["achieved_goal"], start, atol=0.01) for step in env.transitions[100:])
 
 
 def test_adapt_with_two_environments() -> None:
@@ -257,6 +256,7 @@ def test_adapt_needs_an_environment(trained_files: Any) -> None:
 
 
 def test_adapt_from_inside_a_wall(trained: SkillGraphAgent) -> None:
+    trained.learn(10, reset_num_timesteps=False)  # Gymnasium's own checker does not survive a first reset that raises
     with pytest.raises(ValueError, match="free space"):
         trained.adapt(np.array([-1.0, -1.0]), start=np.array([0.0, 0.0]), total_timesteps=50)
     n_steps = trained.num_timesteps

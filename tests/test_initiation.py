@@ -25,9 +25,12 @@ def corridor(n_successes: int = 10, length: float = 5.0) -> InitiationSet:
 
 
 def with_failures() -> InitiationSet:
+    """A corridor, and a branch into it from (0, 3) that worked twice and failed often."""
     initiation = corridor()
+    for seed in range(2):
+        initiation.add_success(path([0.0, 3.0], [5.0, 0.0], noise=0.1, seed=seed))
     for seed in range(8):
-        initiation.add_failure(np.array([0.0, 1.5]) + np.random.default_rng(seed).normal(0.0, 0.2, 2))
+        initiation.add_failure(np.array([0.0, 3.0]) + np.random.default_rng(seed).normal(0.0, 0.1, 2))
     initiation.refit(force=True)
     return initiation
 
@@ -59,6 +62,7 @@ def test_numpy_evaluation_equals_scikit_learns() -> None:
     assert gamma == pytest.approx(1.0 / (2 * max(positives.var(), 0.25 * RADIUS**2)))
     labels = np.repeat([1, 0], [len(positives), len(negatives)])
     split = SVC(gamma=gamma, class_weight="balanced").fit(np.concatenate([positives, negatives]), labels)
+    assert 0 < (split.decision_function(positives) <= 0).sum() < 10  # the core is fitted to the others
     core = OneClassSVM(nu=0.1, gamma=gamma).fit(positives[split.decision_function(positives) > 0])
     points = grid(-1.0, 6.0)
     whole_decision = OneClassSVM(nu=0.01, gamma=gamma).fit(positives).decision_function(points)

@@ -1,6 +1,7 @@
 """What must hold of every skill graph, after any history of runs, refits and triggers."""
 
 import copy
+import math
 from typing import Any
 
 import networkx as nx
@@ -78,7 +79,7 @@ def check_edges(graph: SkillGraph) -> None:
     for source, target, edge in graph.nx.edges(data=True):
         expected = allowed_rate(graph, source, target)
         assert expected > 0, f"{source} -> {target} exists without reason: {edge}"
-        assert edge["success_rate"] == pytest.approx(expected), (source, target)
+        assert math.isclose(edge["success_rate"], expected), (source, target)
         assert edge["success_rate"] >= graph.min_success_rate
         assert np.isfinite(edge["weight"])
         assert edge["weight"] >= 0
@@ -87,8 +88,9 @@ def check_edges(graph: SkillGraph) -> None:
 
 def check_paths(graph: SkillGraph) -> None:
     """Every path returned is one of the graph, the cheapest, and its numbers are those of its edges."""
+    backwards = graph.nx.reverse(copy=True)
     for target in graph.nx:
-        costs = nx.single_source_dijkstra_path_length(graph.nx.reverse(copy=True), target, weight="weight")
+        costs = nx.single_source_dijkstra_path_length(backwards, target, weight="weight")
         for source in graph.nx:
             path = graph.shortest_path([source], target)
             assert (path is not None) == (source in costs)
@@ -96,9 +98,9 @@ def check_paths(graph: SkillGraph) -> None:
                 continue
             assert (path.vertices[0], path.vertices[-1]) == (source, target)
             edges = [graph.nx.edges[edge] for edge in zip(path.vertices[:-1], path.vertices[1:], strict=True)]
-            assert path.cost == pytest.approx(sum(edge["weight"] for edge in edges))
-            assert path.cost == pytest.approx(costs[source])
-            assert path.success_probability == pytest.approx(np.prod([edge["success_rate"] for edge in edges]))
+            assert math.isclose(path.cost, sum(edge["weight"] for edge in edges))
+            assert math.isclose(path.cost, costs[source])
+            assert math.isclose(path.success_probability, math.prod(edge["success_rate"] for edge in edges))
 
 
 def check_starts(world: World) -> None:
@@ -201,7 +203,7 @@ class History:
 
 @every_mode
 @given(operations)
-@profile(40, shrink=False)
+@profile(25, shrink=False)
 def test_an_edge_exists_only_while_its_test_holds(mode: str, sequence: list[tuple[str, int, float, float]]) -> None:
     history = History(mode)
     for operation in sequence:
@@ -211,15 +213,15 @@ def test_an_edge_exists_only_while_its_test_holds(mode: str, sequence: list[tupl
 
 @every_mode
 @given(operations)
-@profile(15, shrink=False)
+@profile(6, shrink=False)
 def test_paths_are_paths_of_the_graph_that_can_be_begun(
     mode: str, sequence: list[tuple[str, int, float, float]]
 ) -> None:
     history = History(mode)
     for k, operation in enumerate(sequence):
         history.apply(*operation)
-        history.graph.shortest_path(list(history.graph.options), "e0")  # what is cached now must not be used later
-        if k % 8 == 0:
+        history.graph.shortest_path(["o1"], "e0")  # what is cached now must not be used later
+        if k == 9:
             check_paths(history.graph)
     check_paths(history.graph)
     check_starts(history.world)
@@ -227,7 +229,7 @@ def test_paths_are_paths_of_the_graph_that_can_be_begun(
 
 @every_mode
 @given(operations, operations)
-@profile(10, shrink=False)
+@profile(4, shrink=False)
 def test_a_restored_graph_is_the_same_graph(
     mode: str, before: list[tuple[str, int, float, float]], after: list[tuple[str, int, float, float]]
 ) -> None:
@@ -260,7 +262,7 @@ runs = st.lists(st.tuples(index, st.integers(-2, 22), st.booleans(), st.booleans
 
 @every_mode
 @given(runs)
-@profile(8, shrink=False)
+@profile(5, shrink=False)
 def test_chains_keep_the_graph_in_order(mode: str, sequence: list[tuple[int, int, bool, bool]]) -> None:
     world = World(**MODES[mode])
     chaining, graph = world.chaining, world.graph

@@ -5,6 +5,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch as th
 from conftest import EAGER, SMALL, TOY, Recorder, check_store, new_agent, new_vec_env
 from gymnasium import spaces
 from hypothesis import given, settings
@@ -57,8 +58,8 @@ def test_other_option_classes_learn(option_class: type, extra: dict[str, Any]) -
     assert agent.options
     assert all(isinstance(option.learner, option_class) for option in agent.options)
     after = agent.policy.state_dict()
-    assert any(not np.array_equal(before[name], after[name]) for name in before if "actor" in name)
-    assert all(np.isfinite(value).all() for value in after.values())
+    assert any(not th.equal(before[name], after[name]) for name in before if "actor" in name)
+    assert all(th.isfinite(value).all() for value in after.values())
 
 
 @pytest.mark.parametrize("n_envs", [1, 2])
@@ -67,12 +68,12 @@ def test_action_noise_is_what_explores(noise_class: type, n_envs: int) -> None:
     def actions(sigma: float) -> np.ndarray:
         noise = noise_class(np.zeros(2), sigma * np.ones(2))
         agent = new_agent(new_vec_env(n_envs=n_envs), action_noise=noise, random_action_prob=0.0, learning_starts=0)
-        agent.learn(60)
+        agent.learn(260)  # the first hundred steps of each are a random walk
         return agent.store.get_state()["columns"]["action"]
 
     assert not np.array_equal(actions(0.5), actions(0.0))
     assert np.abs(actions(0.5)).max() <= 1.0
-    assert len(actions(0.5)) == 60
+    assert len(actions(0.5)) == 260
 
 
 @pytest.mark.parametrize("n_envs", [1, 2])
@@ -114,7 +115,7 @@ def test_salience_may_be_an_object() -> None:
         def propose(self, rng: np.random.Generator) -> np.ndarray:
             return np.array([[-1.0, -1.0], [1.0, 1.0], [1.0, -1.0]])[rng.integers(3)]
 
-    agent = new_agent(salience=Corners()).learn(1200)
+    agent = new_agent(salience=Corners()).learn(600)
     assert len(agent.events) >= 2
     for event in agent.events[1:]:
         assert np.abs(event.center).tolist() == [1.0, 1.0]

@@ -21,7 +21,10 @@ CAPACITY = 12
 #: One step of all environments: who is done, and whether the store is cut afterwards.
 Step = tuple[list[bool], bool]
 steps = st.lists(
-    st.tuples(st.lists(st.integers(0, 3).map(lambda k: k == 0), min_size=3, max_size=3), st.integers(0, 7).map(lambda k: k == 0)),
+    st.tuples(
+        st.lists(st.integers(0, 3).map(lambda k: k == 0), min_size=3, max_size=3),
+        st.integers(0, 7).map(lambda k: k == 0),
+    ),
     min_size=1,
     max_size=25,
 )
@@ -218,7 +221,7 @@ def check_relabelling(store: TransitionStore, samples: ReplayBufferSamples, *, e
             reached = np.linalg.norm(end - EVENT.center) <= EVENT.radius
         assert samples.rewards[i, 0] == (0.0 if reached else -1.0)
         assert samples.dones[i, 0] == float(reached or store.terminated(number)[0])
-    achieved = {tuple(store.column("next_achieved_goal", np.array([row]))[0]) for row in range(store.oldest, store.total)}
+    achieved = {tuple(point) for point in store.column("next_achieved_goal", np.arange(store.oldest, store.total))}
     assert {tuple(goal) for goal in goals[imagined]} <= achieved
     return imagined
 
@@ -250,7 +253,8 @@ def test_both_outcomes_occur_in_the_walks() -> None:
     replay.add_rows(np.arange(0, 120))
     samples = replay.sample(1500)
     reached, done = samples.rewards.numpy() == 0.0, samples.dones.numpy() == 1.0
-    assert {(bool(r), bool(d)) for r, d in zip(reached, done, strict=True)} == {(False, False), (True, True), (False, True)}
+    outcomes = {(bool(r), bool(d)) for r, d in zip(reached, done, strict=True)}
+    assert outcomes == {(False, False), (True, True), (False, True)}
 
 
 @pytest.mark.parametrize("shared", [0.0, 0.25, 1.0])

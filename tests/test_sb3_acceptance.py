@@ -264,6 +264,16 @@ def test_a_callback_that_stops_leaves_no_trace_of_its_step(stop_at: int) -> None
     check_store(agent, env.transitions)
 
 
+def test_a_stopped_step_is_forgotten_by_the_generators_too() -> None:
+    stopped, twin = (new_agent(gym.make(TOY, max_steps=40)) for _ in range(2))
+    stopped.learn(500, callback=Counting(263))
+    twin.learn(262)
+    twin.set_env(twin.get_env())  # forces a fresh episode
+    for agent in (stopped, twin):
+        agent.learn(100, reset_num_timesteps=False)
+    assert differences(state_of(twin)["replay"]["store"], state_of(stopped)["replay"]["store"]) == []
+
+
 def test_the_stock_callbacks(tmp_path: Path) -> None:
     event_callback = Counting()
     eval_callback = EvalCallback(

@@ -113,7 +113,37 @@ def test_steps_between_agrees_with_brute_force(
 ) -> None:
     visited = VisitedStates(2, SPACING, n_envs=3)
     oracle = record_all(visited, sequence)
+    start, goal = (visited.points[np.linalg.norm(visited.points - end, axis=1).argmin()] for end in (start, goal))
     assert visited.steps_between(start, goal, radius) == oracle.steps_between(start, goal, radius)
+
+
+@pytest.mark.parametrize(("start", "goal"), [(0.0, 100.0), (-100.0, 4.0), (-100.0, 100.0), (-2.0, 0.0)])
+def test_no_steps_between_places_that_no_trajectory_came_near(start: float, goal: float) -> None:
+    visited = VisitedStates(2, SPACING)
+    straight(visited, 5)
+    assert visited.steps_between(np.array([start, 0.0]), np.array([goal, 0.0]), 0.5) == np.inf
+
+
+@given(moves, points, st.sampled_from([0.6, 1.5]))
+@profile(40)
+def test_path_from_is_the_quickest_way_from_an_event(sequence: list[Move], point: np.ndarray, radius: float) -> None:
+    visited = VisitedStates(2, SPACING, n_envs=3)
+    oracle = record_all(visited, sequence)
+    near = oracle.near(point, radius)
+    for event in range(len(CENTERS)):
+        way = visited.path_from(event, point, radius)
+        quickest = oracle.events(point, radius, -1).get(event)
+        assert way.shape == (len(way), 2)
+        assert (len(way) > 0) == (quickest is not None)
+        if quickest is not None:
+            assert oracle.label(way[0]) == event
+            assert all(oracle.label(p) < 0 for p in way[1:])
+            ways = []
+            for i in near:
+                trajectory, step, _ = oracle.kept[i]
+                if oracle.passed(i, -1) == (event, quickest):
+                    ways.append([p for t, s, p in oracle.kept if t == trajectory and step - quickest <= s <= step])
+            assert any(len(one) == len(way) and np.array_equal(np.stack(one), way) for one in ways)
 
 
 @given(moves, st.integers(0, 12))

@@ -1,0 +1,265 @@
+"""Options chosen and run on hand-built graphs, one step at a time (sections 3.2.4, 3.2.5)."""
+
+import numpy as np
+import pytest
+from builders import World
+
+from sb3_skillgraph.controller import GLOBAL, UNDECIDED, Controller, ControllerState, Request
+
+O1, O2, O3, O4 = 1, 2, 3, 4
+
+
+def at(*xs: float) -> np.ndarray:
+    """Points on the line, shape ``(n, 2)``."""
+    return np.stack([np.array(xs), np.zeros(len(xs))], axis=1)
+
+
+def observe(points: np.ndarray) -> dict[str, np.ndarray]:
+    return {"observation": points.astype(np.float32), "achieved_goal": points.astype(np.float32)}
+
+
+def to_event(world: World, id: str) -> Request:
+    return Request(world.graph.events[id].center, event=id)
+
+
+@pytest.fixture
+def line() -> World:
+    world = World()
+    world.line()
+    return world
+
+
+def choose(world: World, x: float, request: Request, failures: int = 0, avoid: int = -1) -> tuple[int, int]:
+    return world.controller.choose(at(x)[0], request, failures, avoid)
+
+
+def state(n_envs: int = 1, **fields: list[int]) -> ControllerState:
+    return ControllerState.fresh(n_envs)._replace(**{name: np.array(value) for name, value in fields.items()})
+
+
+def test_a_fresh_state_is_undecided() -> None:
+    fresh = ControllerState.fresh(3)
+    assert all(array.shape == (3,) for array in fresh)
+    assert fresh.option.tolist() == [UNDECIDED] * 3
+    assert fresh.failures.tolist() == fresh.steps.tolist() == [0] * 3
+    assert fresh.avoid.tolist() == fresh.aim.tolist() == [-1] * 3
+    copied = fresh.copy()
+    assert not any(np.shares_memory(a, b) for a, b in zip(copied, fresh, strict=True))
+    assert len({array.__array_interface__["data"][0] for array in fresh}) == 5
+
+
+# -- choosing ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("x", "target", "option"),
+    [
+        (0, "e2", O1),
+        (0, "e1", O1),
+        (10, "e2", O2),
+        (20, "e0", O3),
+        (10, "e0", O4),
+        (12, "e2", O2),
+    ],
+)
+def test_the_first_option_of_the_plan_is_chosen(line: World, x: float, target: str, option: int) -> None:
+    assert choose(line, x, to_event(line, target)) == (option, -1)
+
+
+def test_no_option_is_chosen_from_outside_its_initiation_set(line: World) -> None:
+    for x in np.linspace(-5, 25, 61):
+        for target in line.graph.events:
+            for request in (to_event(line, target), Request(line.graph.events[target].center)):
+                index, aim = choose(line, x, request)
+                assert index == GLOBAL or line.controller.option(index).initiation.optimistic(at(x))[0]
+                assert aim == -1 or index == GLOBAL
+
+
+def test_outside_the_graph_the_agent_walks_to_where_it_can_be_entered(line: World) -> None:
+    option, aim = choose(line, 5.0, to_event(line, "e2"))
+    assert option == GLOBAL
+    assert aim in (0, 1)
+    for id in ("o1", "o2", "o3", "o4"):
+        line.graph.remove_option(line.graph.options[id])
+    assert choose(line, 5.0, to_event(line, "e2")) == (GLOBAL, 2)  # straight to the event, where nothing leads on
+
+
+def test_direct_requests_and_an_agent_that_does_not_plan_walk_straight(line: World) -> None:
+    assert choose(line, 0.0, Request(at(20.0)[0], direct=True)) == (GLOBAL, -1)
+    assert choose(line, 0.0, Request(at(20.0)[0])) == (O1, -1)
+    line.controller.planning = False
+    assert choose(line, 0.0, Request(at(20.0)[0])) == (GLOBAL, -1)
+    assert choose(line, 0.0, to_event(line, "e2")) == (GLOBAL, -1)
+
+
+def test_a_detour_around_the_option_that_has_just_failed(line: World) -> None:
+    detour = line.add_option(line.graph.events["e1"], (0.0, 0.0), failures=8)
+    for request in (to_event(line, "e2"), Request(at(20.0)[0])):
+        assert choose(line, 0.0, request) == (O1, -1)
+        assert choose(line, 0.0, request, avoid=O1) == (line.controller.index(detour), -1)
+        assert choose(line, 0.0, request, avoid=O2) == (O1, -1)
+
+
+def test_after_a_failed_approach_the_next_leg(line: World) -> None:
+    line.add_option(line.graph.events["e2"], (0.0, 0.0), failures=7)  # straight to e2, but dear
+    goal = Request(at(14.0)[0])
+    legs = line.planner.legs(at(0.0)[0], goal.goal)
+    starts = [leg.path.vertices[0] for leg in legs if leg.path is not None]
+    assert len(starts) == len(legs) >= 2
+    for failures in range(len(legs) + 2):  # the last leg is kept to
+        expected = starts[min(failures, len(legs) - 1)]
+        assert choose(line, 0.0, goal, failures) == (int(expected[1:]), -1)
+
+
+def test_a_failed_approach_leads_to_another_event() -> None:
+    """Two events from which the goal has been reached, each with its option from the start."""
+    world = World()
+    start, near, far = world.add_event(0.0, 0.0), world.add_event(10.0, 0.0), world.add_event(0.0, 10.0)
+    first, second = world.add_option(near, (0.0, 0.0)), world.add_option(far, (0.0, 0.0))
+    world.walk((0, 0), (0, 0), 1)
+    world.walk((10, 0), (10, 10), 20)
+    world.walk((0, 10), (10, 10), 35)
+    goal = Request(np.array([10.0, 10.0]))
+    chosen = [world.controller.choose(start.center, goal, failures, -1)[0] for failures in range(3)]
+    assert chosen == [world.controller.index(first), world.controller.index(second), world.controller.index(second)]
+
+
+def test_practice_plans_to_the_chains_source_and_then_follows_the_chain(line: World) -> None:
+    chain = line.chaining.open_chain(line.graph.events["e1"], line.graph.events["e2"])
+    root = line.chaining.options[chain.options[0]]
+    request = Request(at(20.0)[0], event="e2", chain=chain.id)
+    assert choose(line, 0.0, request) == (O1, -1)
+    assert choose(line, 10.0, request) == (line.controller.index(root), -1)
+    assert choose(line, 0.0, request._replace(left_graph=True)) == (line.controller.index(root), -1)
+
+
+# -- closed loop ------------------------------------------------------------------------------------------------------
+
+
+def test_it_plans_anew_after_every_option(line: World) -> None:
+    controller, request = line.controller, [to_event(line, "e2")]
+    actions, aims, running = controller.act(observe(at(0.0)), ControllerState.fresh(1), request)
+    assert (running.option.tolist(), running.steps.tolist()) == ([O1], [1])
+    np.testing.assert_array_equal(aims, at(10.0))
+    assert actions.shape == (1, 2)
+    running, outcomes = controller.advance(running, at(5.0), request)
+    assert outcomes == []
+    _, _, running = controller.act(observe(at(5.0)), running, request)
+    assert (running.option.tolist(), running.steps.tolist()) == ([O1], [2])  # no new choice in the middle of a run
+    running, outcomes = controller.advance(running, at(10.3), request)
+    assert outcomes == [(0, O1, -1, True, 2)]
+    assert running.option.tolist() == [UNDECIDED]
+    _, aims, running = controller.act(observe(at(10.3)), running, request)
+    assert (running.option.tolist(), running.steps.tolist()) == ([O2], [1])
+    np.testing.assert_array_equal(aims, at(20.0))
+
+
+def test_it_plans_from_where_it_landed_not_from_where_it_should_have(line: World) -> None:
+    controller, request = line.controller, [to_event(line, "e2")]
+    running, _ = controller.advance(state(option=[O2], steps=[10]), at(1.0), request)
+    _, _, running = controller.act(observe(at(1.0)), running, request)
+    assert running.option.tolist() == [O1]
+
+
+@pytest.mark.parametrize(("option", "timeout"), [(O1, 10), (GLOBAL, 5)])
+def test_options_time_out_the_global_one_sooner(line: World, option: int, timeout: int) -> None:
+    request = [to_event(line, "e2")]
+    running, outcomes = line.controller.advance(state(option=[option], steps=[timeout - 1]), at(5.0), request)
+    assert outcomes == []
+    running, outcomes = line.controller.advance(state(option=[option], steps=[timeout]), at(5.0), request)
+    assert outcomes == [(0, option, -1, False, timeout)]
+    assert running.option.tolist() == [UNDECIDED]
+
+
+def test_success_beats_a_timeout_on_the_same_step(line: World) -> None:
+    request = [to_event(line, "e2")]
+    for option, x, steps in ((O1, 10.0, 10), (GLOBAL, 20.0, 5)):
+        _, outcomes = line.controller.advance(state(option=[option], steps=[steps]), at(x), request)
+        assert outcomes == [(0, option, -1, True, steps)]
+
+
+def test_the_global_option_ends_where_it_walks_to(line: World) -> None:
+    request = [Request(at(14.0)[0])]
+    for aim, x, ended in ((1, 10.5, True), (1, 14.0, False), (-1, 14.5, True), (-1, 10.5, False)):
+        _, outcomes = line.controller.advance(state(option=[GLOBAL], aim=[aim], steps=[1]), at(x), request)
+        assert bool(outcomes) == ended
+        assert all(outcome.success and outcome.aim == aim for outcome in outcomes)
+
+
+def test_what_failed_is_remembered_until_something_else_ends(line: World) -> None:
+    request = [to_event(line, "e2")]
+    running, _ = line.controller.advance(state(option=[O1], steps=[10]), at(5.0), request)
+    assert (running.avoid.tolist(), running.failures.tolist()) == ([O1], [0])
+    succeeded, _ = line.controller.advance(running._replace(option=np.array([O2])), at(20.0), request)
+    assert succeeded.avoid.tolist() == [-1]
+    walked, _ = line.controller.advance(
+        running._replace(option=np.array([GLOBAL]), steps=np.array([5])), at(5.0), request
+    )
+    assert (walked.avoid.tolist(), walked.failures.tolist()) == ([-1], [1])
+
+
+def test_a_walk_to_an_event_is_no_approach_to_the_goal(line: World) -> None:
+    """``failures`` counts approaches to the goal; a failed walk to where the graph can be entered is none."""
+    walk = state(option=[GLOBAL], aim=[0], steps=[5])
+    running, outcomes = line.controller.advance(walk, at(5.0), [Request(at(14.0)[0])])
+    assert [outcome.success for outcome in outcomes] == [False]
+    assert running.failures.tolist() == [0]
+
+
+def test_inputs_are_left_as_they_were(line: World) -> None:
+    controller, requests = line.controller, [to_event(line, "e2"), Request(at(14.0)[0]), to_event(line, "e0")]
+    points = at(10.0, 5.0, 10.0).astype(np.float32)
+    before = state(3, option=[O1, UNDECIDED, UNDECIDED], steps=[3, 0, 0])
+    kept, kept_points = before.copy(), points.copy()
+    first, second = (controller.advance(before, points, requests) for _ in range(2))
+    assert first[1] == second[1] == [(0, O1, -1, True, 3)]
+    observation = observe(points)
+    one, other = (controller.act(observation, before, requests) for _ in range(2))
+    for a, b in zip(one[2], other[2], strict=True):
+        np.testing.assert_array_equal(a, b)
+    np.testing.assert_array_equal(one[0], other[0])
+    for a, b in zip(before, kept, strict=True):
+        np.testing.assert_array_equal(a, b)
+    np.testing.assert_array_equal(points, kept_points)
+    np.testing.assert_array_equal(observation["achieved_goal"], kept_points)
+    for after in (one[2], first[0]):
+        assert not any(np.shares_memory(a, b) for a, b in zip(after, before, strict=True))
+
+
+@pytest.mark.parametrize("n_envs", [1, 2, 5])
+def test_environments_do_not_disturb_each_other(line: World, n_envs: int) -> None:
+    controller = line.controller
+    xs = [0.0, 10.0, 20.0, 5.0, 12.0][:n_envs]
+    requests = [to_event(line, id) for id in ("e2", "e0", "e1", "e0", "e2")[:n_envs]]
+    actions, aims, running = controller.act(observe(at(*xs)), ControllerState.fresh(n_envs), requests)
+    assert actions.shape == aims.shape == (n_envs, 2)
+    assert (np.abs(actions) <= 1.0).all()
+    assert all(array.shape == (n_envs,) for array in running)
+    for i in range(n_envs):
+        alone = controller.act(observe(at(xs[i])), ControllerState.fresh(1), [requests[i]])
+        np.testing.assert_allclose(actions[i], alone[0][0], atol=1e-6)
+        np.testing.assert_array_equal(aims[i], alone[1][0])
+        assert [int(array[i]) for array in running] == [int(array[0]) for array in alone[2]]
+    ends = np.stack([line.graph.events["e1"].center] * n_envs)
+    after, outcomes = controller.advance(running, ends, requests)
+    assert all(array.shape == (n_envs,) for array in after)
+    assert {outcome.env for outcome in outcomes} == set(np.flatnonzero(after.option == UNDECIDED))
+
+
+def test_gestating_options_act_with_the_global_policy_only_when_warm_started(line: World) -> None:
+    chain = line.chaining.open_chain(line.graph.events["e0"], line.graph.events["e2"])
+    root = line.chaining.options[chain.options[0]]
+    request = [Request(at(20.0)[0], event="e2", chain=chain.id)]
+    cold = line.controller
+    warm = Controller(line.global_option, line.chaining, line.planner, cold.view, 1.0, 10, warm_start=True)
+    observation = observe(at(0.0))
+    seen = cold.view(observation["observation"], observation["achieved_goal"], at(20.0))
+    for controller, mature, actor in (
+        (cold, False, root.actor),
+        (warm, False, line.global_option.actor),
+        (warm, True, root.actor),
+    ):
+        root.mature = mature
+        actions, _, _ = controller.act(observation, state(option=[controller.index(root)]), request)
+        np.testing.assert_array_equal(actions, actor.act(seen))
+    assert not np.allclose(root.actor.act(seen), line.global_option.actor.act(seen))

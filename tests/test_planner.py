@@ -1,0 +1,160 @@
+"""Plans on hand-built graphs with known answers (sections 3.2.3, 3.2.4 and 3.3)."""
+
+import numpy as np
+import pytest
+from builders import World
+
+from sb3_skillgraph.planner import Status
+
+
+def at(x: float, y: float = 0.0) -> np.ndarray:
+    return np.array([x, y])
+
+
+@pytest.fixture
+def line() -> World:
+    world = World()
+    world.line()
+    return world
+
+
+@pytest.mark.parametrize(
+    ("goal", "status"),
+    [
+        (at(10.0), "in_graph"),  # Figure 2 (a)
+        (at(10.5, 0.5), "in_graph"),
+        (at(12.0), "in_initiation_set"),  # (b): an option starts here, but the region holds no option's effects
+        (at(50.0), "outside"),  # (c)
+        (at(5.0), "outside"),
+    ],
+)
+def test_the_three_cases_of_a_goal(line: World, goal: np.ndarray, status: Status) -> None:
+    assert line.planner.status(goal, 1.0) == status
+    assert line.planner.plan(at(0.0), goal, 1.0).status == status
+
+
+def test_a_region_that_holds_an_options_effects_is_in_the_graph() -> None:
+    world = World()
+    target = world.add_event(10.0, 0.0)
+    option = world.add_option(target, (0.0, 0.0), successes=0)
+    for _ in range(10):
+        option.succeeded(np.zeros((2, 2)), at(10.9))
+    assert world.planner.status(at(11.5), 1.0) == "in_graph"  # the event's centre lies outside the region
+    assert world.planner.status(at(12.5), 1.0) == "outside"
+    option.succeeded(np.zeros((2, 2)), at(9.5))
+    assert world.planner.status(at(11.5), 1.0) == "in_graph"  # ten of eleven
+    option.succeeded(np.zeros((2, 2)), at(9.5))
+    assert world.planner.status(at(11.5), 1.0) == "outside"  # ten of twelve
+
+
+def test_an_empty_world_has_no_plan() -> None:
+    world = World()
+    assert world.planner.plan(at(0.0), at(5.0), 1.0) == ("outside", (), np.inf, 0.0)
+    assert world.planner.legs(at(0.0), at(5.0)) == []
+    assert world.planner.entry(at(0.0), None) is None
+    assert world.planner.coverage() == 0.0
+
+
+def test_a_plan_over_the_graph(line: World) -> None:
+    plan = line.planner.plan(at(0.0), at(20.0), 1.0)
+    assert plan.path[0] == "o1"
+    assert plan.path[-1] == "e2"
+    assert set(plan.path) <= {"o1", "e1", "o2", "e2"}
+    rate = 9 / 10  # eight successes and two pseudo-counts
+    assert plan.success_probability == pytest.approx(rate**2)
+    assert plan.cost == pytest.approx(2 / rate)
+
+
+def test_no_plan_starts_outside_its_first_options_initiation_set(line: World) -> None:
+    assert line.planner.path_to(at(5.0), "e2") is None
+    path = line.planner.path_to(at(12.0), "e2")
+    assert path is not None
+    assert path.vertices == ("o2", "e2")
+
+
+def test_a_detour_around_an_option_that_has_just_failed(line: World) -> None:
+    assert line.planner.path_to(at(0.0), "e1", avoid="o1") is None
+    line.add_option(line.graph.events["e1"], (0.0, 0.0), failures=8)
+    best, second = line.planner.path_to(at(0.0), "e1"), line.planner.path_to(at(0.0), "e1", avoid="o1")
+    assert best is not None
+    assert second is not None
+    assert (best.vertices, second.vertices) == (("o1", "e1"), ("o5", "e1"))
+    assert best.cost < second.cost
+    again = line.planner.path_to(at(0.0), "e1", avoid="o5")
+    assert again == best
+
+
+def test_event_at_is_the_nearest_event_that_holds_the_point(line: World) -> None:
+    line.add_event(11.0, 0.0)
+    assert [e.id if (e := line.planner.event_at(at(x))) else None for x in (0.4, 5.0, 10.2, 10.8)] == [
+        "e0",
+        None,
+        "e1",
+        "e3",
+    ]
+
+
+def test_the_nearest_vertex_is_nearest_in_steps_and_walls_do_not_fool_it() -> None:
+    """A goal behind a wall: near to e1 as the crow flies, but reached from e0."""
+    for nearest, expected in (("steps", ["e0"]), ("euclidean", ["e1", "e0"])):
+        world = World(nearest=nearest)
+        world.add_event(0.0, 0.0)
+        world.add_event(10.0, 0.0)
+        world.walk((0, 0), (10, 2), 30)
+        ranked = world.planner.vertices_near(at(10.0, 2.0))
+        assert [event.id for event, _ in ranked] == expected
+        assert [distance for _, distance in ranked] == sorted(distance for _, distance in ranked)
+
+
+def test_coming_back_from_a_goal_tells_less_than_going_there() -> None:
+    world = World()
+    world.add_event(0.0, 0.0)
+    world.add_event(10.0, 0.0)
+    world.walk((5, 0), (0, 0), 20)  # back to e0: in so many steps, and half as many again for doubt
+    world.walk((10, 0), (5, 0), 20)  # from e1 there
+    [(first, there), (second, back)] = world.planner.vertices_near(at(5.0))
+    assert (first.id, second.id) == ("e1", "e0")
+    assert back / there == pytest.approx(1.5, rel=0.2)
+
+
+def test_legs_are_sorted_and_add_up(line: World) -> None:
+    legs = line.planner.legs(at(0.0), at(14.0))
+    assert [leg.cost for leg in legs] == sorted(leg.cost for leg in legs)
+    assert [leg.event for leg in legs] == ["e1", "e2"]
+    first = legs[0]
+    assert first.path is not None
+    assert first.path.vertices == ("o1", "e1")
+    steps = {event.id: n for event, n in line.planner.vertices_near(at(14.0))}
+    assert first.cost == pytest.approx(first.path.cost + steps["e1"] / line.planner.reach)
+
+
+def test_a_goal_close_at_hand_is_walked_to_directly(line: World) -> None:
+    legs = line.planner.legs(at(10.0), at(14.0))
+    assert legs[0].path is None
+    assert line.planner.plan(at(10.0), at(14.0), 1.0).path == ("e1",)
+
+
+def test_a_plan_without_a_path_promises_nothing(line: World) -> None:
+    """``path`` is empty if no path leads there; then the cost is infinite and the probability 0."""
+    for x in (5.0, 12.0, 15.0, 50.0, -30.0):
+        for goal in (7.0, 14.0, 60.0, -40.0):
+            plan = line.planner.plan(at(x), at(goal), 1.0)
+            if not plan.path:
+                assert (plan.cost, plan.success_probability) == (np.inf, 0.0), (x, goal)
+
+
+def test_the_graph_is_entered_where_it_leads_on(line: World) -> None:
+    entry = line.planner.entry(at(5.0), "e2")
+    assert entry is not None
+    assert entry.id in ("e0", "e1")
+    for id in ("o1", "o2"):
+        line.graph.remove_option(line.graph.options[id])
+    assert line.planner.entry(at(5.0), "e2") is None  # from what lies next, nothing leads there any more
+    inside = line.planner.entry(at(0.0), None)
+    assert inside is None or inside.id != "e0"  # it is there already
+
+
+def test_coverage_is_the_share_of_visited_states_one_can_go_on_from(line: World) -> None:
+    assert line.planner.coverage() == pytest.approx((3 + 6 + 3) / 20, abs=0.05)
+    line.add_option(line.graph.events["e0"], (10.0, 0.0), start_radius=30.0)
+    assert line.planner.coverage() == 1.0
