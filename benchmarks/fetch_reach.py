@@ -1,6 +1,6 @@
 """A goal space of three dimensions and an arm: success on FetchReach's own resets.
 
-    python -m benchmarks.fetch_reach --out benchmarks/results/fetch_reach.json
+python -m benchmarks.fetch_reach --out benchmarks/results/fetch_reach.json
 """
 
 import argparse

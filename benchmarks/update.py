@@ -70,9 +70,7 @@ def build(cls: type[TD3], case: Case) -> TD3:
     policy_kwargs = {"net_arch": list(case.net_arch)}
     # SB3 takes None for an environment and says otherwise.
     no_env: Any = None
-    model = cls(
-        "MlpPolicy", no_env, policy_kwargs=policy_kwargs, buffer_size=10_000, device="cpu", _init_setup_model=False
-    )
+    model = cls("MlpPolicy", no_env, policy_kwargs=policy_kwargs, buffer_size=10_000, device="cpu", _init_setup_model=False)
     model.observation_space = spaces.Box(-np.inf, np.inf, (n_obs,), np.float32)
     model.action_space = spaces.Box(-1, 1, (n_actions,), np.float32)
     model.n_envs = 1

@@ -1,5 +1,6 @@
 """The agent: an SB3 off-policy algorithm that discovers, plans, chains and learns (section 3, Figure 10)."""
 
+import copy
 from typing import Any, ClassVar, Literal, NamedTuple, TypeVar
 
 import numpy as np
@@ -11,12 +12,11 @@ from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
-from stable_baselines3.common.vec_env import unwrap_vec_normalize
 from stable_baselines3.td3.policies import MultiInputPolicy
 
 from sb3_skillgraph.assembly import Assembly
 from sb3_skillgraph.controller import GLOBAL, UNDECIDED, ControllerState, Request
-from sb3_skillgraph.goal_env import KEYS, GoalSpec, check_finite, rows
+from sb3_skillgraph.goal_env import KEYS, GoalSpec, check_finite, refuse_vec_normalize, rows
 from sb3_skillgraph.interrupts import uninterrupted
 from sb3_skillgraph.options.learner import OptionDDPG
 from sb3_skillgraph.options.option import Option
@@ -80,9 +80,9 @@ class SkillGraphAgent(Assembly):
     :param replay_buffer_kwargs: refused
     :param optimize_memory_usage: refused
     :param n_steps: refused unless 1
-    :param policy_kwargs: keyword arguments of every option's policy; ``net_arch`` is ``[128, 128]`` unless given
     :param stats_window_size: episodes over which SB3's rollout statistics are averaged
     :param tensorboard_log: folder of the TensorBoard log
+    :param policy_kwargs: keyword arguments of every option's policy; ``net_arch`` is ``[128, 128]`` unless given
     :param verbose: 0 for silence, 1 for the progress table
     :param seed: seed of all generators
     :param device: torch device
@@ -151,9 +151,9 @@ class SkillGraphAgent(Assembly):
         replay_buffer_kwargs: dict[str, Any] | None = None,
         optimize_memory_usage: bool = False,
         n_steps: int = 1,
-        policy_kwargs: dict[str, Any] | None = None,
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
+        policy_kwargs: dict[str, Any] | None = None,
         verbose: int = 0,
         seed: int | None = None,
         device: th.device | str = "auto",
@@ -198,6 +198,9 @@ class SkillGraphAgent(Assembly):
         # The keyword arguments as given: what is saved, and what load() builds the agent from.
         self._arguments = {k: v for k, v in locals().items() if k not in ("self", "env", "_init_setup_model", "__class__")}
         _refuse(replay_buffer_class, replay_buffer_kwargs, optimize_memory_usage, n_steps, use_sde)
+        refuse_vec_normalize(env)
+        if env is not None and not isinstance(env, str):
+            GoalSpec.of(env.observation_space, env.action_space)  # before SB3 asserts less clearly
         super().__init__(
             policy=policy,
             env=env,  # type: ignore[arg-type]
@@ -223,13 +226,8 @@ class SkillGraphAgent(Assembly):
         self._random_action_prob = random_action_prob
         self._random_hold = random_hold
         self._reset_options: dict[str, Any] = {}  # while adapting: where episodes start
-        if env is not None:
+        if self.env is not None:
             self._spec = GoalSpec.of(self.observation_space, self.action_space)
-        if self.env is not None and unwrap_vec_normalize(self.env) is not None:
-            raise ValueError(
-                "VecNormalize is not supported: events and initiation sets live in raw goal space. Networks see goal "
-                "space in units of the event radius already; remove the wrapper."
-            )
         if _init_setup_model:
             self._setup_model()
 
@@ -274,11 +272,17 @@ class SkillGraphAgent(Assembly):
             self.rng.bit_generator.state = self._pending.rng_state
             self._last_obs = None
         resumed = not reset_num_timesteps and self._restore_env()
+        self._env_snapshot = None
         goes_on = resumed or (not reset_num_timesteps and self._last_obs is not None)
+        noise = copy.deepcopy(self.action_noise) if goes_on else None
         total, callback = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
-        assert isinstance(self._last_obs, dict)
+        if noise is not None:
+            self.action_noise = noise  # SB3 resets it at every call
         if not goes_on:
-            check_finite(self._last_obs, self.num_timesteps)
+            first, self._last_obs = self._last_obs, None
+            assert isinstance(first, dict)
+            check_finite(first, self.num_timesteps)
+            self._last_obs = first  # type: ignore[assignment]
             self._begin_episodes()
             self.store.cut()
             self.visited.cut(self.n_envs)
@@ -388,7 +392,7 @@ class SkillGraphAgent(Assembly):
             self.visited.record(i, self.num_timesteps, points[i], bool(dones[i]))
             if self.curriculum.observe(i, before[i], points[i], by_env.get(i), bool(dones[i])):
                 self._state.option[i] = UNDECIDED
-                self._state.failures[i], self._state.avoid[i] = 0, -1
+                self._state.failures[i], self._state.failed_last[i], self._state.failed_before[i] = 0, -1, -1
             if dones[i]:
                 self._hold_left[i] = 0
 
@@ -513,7 +517,10 @@ class SkillGraphAgent(Assembly):
         return self.planner.plan(batch["achieved_goal"][0], target, self.event_radius)
 
     def _checked_goal(self, goal: np.ndarray) -> np.ndarray:
-        array = np.asarray(goal, dtype=np.float64)
+        try:
+            array = np.asarray(goal, dtype=np.float64)
+        except (TypeError, ValueError):
+            array = np.full(0, np.nan)
         if array.shape != (self._spec.goal_dim,) or not np.isfinite(array).all():
             raise ValueError(f"A goal must be a finite vector of shape ({self._spec.goal_dim},), not {goal!r}.")
         return array
@@ -548,7 +555,9 @@ class SkillGraphAgent(Assembly):
             self.curriculum.pin(target)
             return self.learn(total_timesteps, callback, log_interval=None, reset_num_timesteps=False)
         finally:
-            self.curriculum.pinned, self._reset_options, self._last_obs = None, {}, None
+            self.curriculum.unpin()
+            self.env.set_options()
+            self._reset_options, self._last_obs = {}, None
 
 
 class _Pending(NamedTuple):

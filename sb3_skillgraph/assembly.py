@@ -23,7 +23,6 @@ from sb3_skillgraph.salience.discovery import EventDiscovery
 from sb3_skillgraph.salience.proposals import FrontierSalience, RandomSalience, Salience
 from sb3_skillgraph.visited import VisitedStates
 
-
 NET_ARCH = [128, 128]  # of every network: each option has a small job
 
 

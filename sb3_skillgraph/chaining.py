@@ -166,7 +166,7 @@ class DeepSkillChaining:
         if startable or not last.mature:
             return
         tried = self.graph.evidence.get((source.id, last.id), ())
-        if not tried or (len(tried) >= self.gestation_period and sum(tried) * 2 < len(tried)):
+        if not tried or not self.graph.evidence_edges or (len(tried) >= self.gestation_period and sum(tried) * 2 < len(tried)):
             self._grow(chain, last.id, last)
 
     def unsettled(self) -> set[str]:

@@ -1,12 +1,13 @@
 """Which option runs, for how long, and what it does: one environment step at a time (sections 3.2.4, 3.2.5, A.6)."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from sb3_skillgraph.chaining import DeepSkillChaining
 from sb3_skillgraph.events import SalientEvent, TerminationSet
+from sb3_skillgraph.graph import GraphPath
 from sb3_skillgraph.options.execution import Fate, fate
 from sb3_skillgraph.options.numpy_actor import NumpyActor
 from sb3_skillgraph.options.option import Option
@@ -21,22 +22,25 @@ class ControllerState(NamedTuple):
 
     :param option: index of the running option, or ``UNDECIDED``
     :param steps: environment steps it has run
-    :param aim: index of the event the global option walks to, ``-1`` for the goal itself
+    :param aim: where the global option walks to: ``-1`` the goal itself, ``k >= 0`` event ``k``, ``-2 - k`` visited
+        point ``k``
     :param failures: approaches to the goal that have failed
-    :param avoid: index of an option that has just failed, ``-1`` for none
+    :param failed_last: index of the option that failed last on the way to the goal, ``-1`` for none
+    :param failed_before: index of the one that failed before it, ``-1`` for none
     """
 
     option: np.ndarray
     steps: np.ndarray
     aim: np.ndarray
     failures: np.ndarray
-    avoid: np.ndarray
+    failed_last: np.ndarray
+    failed_before: np.ndarray
 
     @classmethod
     def fresh(cls, n_envs: int) -> "ControllerState":
         """Return the state at the start of an episode."""
         undecided, zeros = np.full(n_envs, UNDECIDED), np.zeros(n_envs, dtype=np.int64)
-        return cls(undecided, zeros, np.full(n_envs, -1), zeros.copy(), np.full(n_envs, -1))
+        return cls(undecided, zeros, np.full(n_envs, -1), zeros.copy(), np.full(n_envs, -1), np.full(n_envs, -1))
 
     def copy(self) -> "ControllerState":
         """Return a copy that shares no memory."""
@@ -65,7 +69,7 @@ class OptionOutcome(NamedTuple):
 
     :param env: which environment
     :param option: index of the option
-    :param aim: index of the event the global option walked to, ``-1`` for the goal itself
+    :param aim: where the global option walked to (see :class:`ControllerState`)
     :param success: whether it reached its termination set; None if it was cut short
     :param steps: environment steps it ran
     """
@@ -148,8 +152,10 @@ class Controller:
             success = ended == Fate.SUCCEEDED
             outcomes.append(OptionOutcome(i, index, aim, success, steps))
             state.option[i] = UNDECIDED
-            state.avoid[i] = -1 if success or index == GLOBAL else index
-            state.failures[i] += not success and index == GLOBAL
+            if not success and index == GLOBAL:
+                state.failures[i] += aim < 0
+            elif not success and index != state.failed_last[i]:
+                state.failed_before[i], state.failed_last[i] = state.failed_last[i], index
         return state, outcomes
 
     def _termination(self, index: int, aim: int, request: Request) -> TerminationSet:
@@ -157,7 +163,7 @@ class Controller:
             termination = self.option(index).termination
             assert termination is not None
             return termination
-        return self.event(aim) if aim >= 0 else SalientEvent("goal", request.goal, self.radius)
+        return self.event(aim) if aim >= 0 else SalientEvent("goal", self._aim(index, aim, request), self.radius)
 
     def act(
         self,
@@ -176,7 +182,8 @@ class Controller:
         state = state.copy()
         points = observation["achieved_goal"]
         for i in np.flatnonzero(state.option == UNDECIDED).tolist():
-            state.option[i], state.aim[i] = self.choose(points[i], requests[i], int(state.failures[i]), int(state.avoid[i]))
+            failed = {int(state.failed_last[i]), int(state.failed_before[i])}
+            state.option[i], state.aim[i] = self.choose(points[i], requests[i], int(state.failures[i]), failed)
             state.steps[i] = 0
         aims = np.stack([self._aim(int(o), int(a), r) for o, a, r in zip(state.option, state.aim, requests, strict=True)])
         seen = self.view(observation["observation"], points, aims)
@@ -196,29 +203,31 @@ class Controller:
     def _aim(self, index: int, aim: int, request: Request) -> np.ndarray:
         if index != GLOBAL:
             return self.option(index).subgoal
-        return self.event(aim).center if aim >= 0 else request.goal
+        if aim >= 0:
+            return self.event(aim).center
+        return request.goal if aim == -1 else self.planner.visited.points[-2 - aim].astype(np.float64)
 
     # -- choosing an option -------------------------------------------------------------------------------------------
 
-    def choose(self, point: np.ndarray, request: Request, failures: int, avoid: int) -> tuple[int, int]:
+    def choose(self, point: np.ndarray, request: Request, failures: int, failed: Collection[int]) -> tuple[int, int]:
         """Choose the option to run next.
 
         :param point: where the agent stands, shape ``(goal_dim,)``
         :param request: what it is to do
         :param failures: approaches to the goal that have failed
-        :param avoid: index of an option that has just failed, ``-1`` for none
-        :return: index of the option; index of the event the global option is to walk to, ``-1`` for the goal
+        :param failed: indices of options that have failed lately
+        :return: index of the option; where the global option is to walk to (see :class:`ControllerState`)
         """
         if request.direct or not self.planning:
             return GLOBAL, -1
-        avoided = self.option(avoid).id if avoid > GLOBAL else None
+        avoid = [self.option(index).id for index in failed if index > GLOBAL]
         if request.chain is not None:
-            return self._practise(point, request, avoided)
+            return self._practise(point, request, avoid)
         if request.event is not None:
-            return self._towards(point, request.event, avoided)
-        return self._to_goal(point, request.goal, failures, avoided)
+            return self._towards(point, request.event, avoid)
+        return self._to_goal(point, request.goal, failures, avoid)
 
-    def _practise(self, point: np.ndarray, request: Request, avoid: str | None) -> tuple[int, int]:
+    def _practise(self, point: np.ndarray, request: Request, avoid: Collection[str]) -> tuple[int, int]:
         """Plan to the chain's source; from there on, the chain's earliest admissible option (section 3.2.5)."""
         assert request.chain is not None
         chain = self.chaining.chains[request.chain]
@@ -227,23 +236,28 @@ class Controller:
             return self.index(self.chaining.admissible(chain, point)), -1
         return self._towards(point, source.id, avoid)
 
-    def _towards(self, point: np.ndarray, event: str, avoid: str | None) -> tuple[int, int]:
+    def _towards(self, point: np.ndarray, event: str, avoid: Collection[str]) -> tuple[int, int]:
         """Follow the plan to an event; outside the graph, walk to where it can be entered."""
         path = self.planner.path_to(point, event, avoid)
         if path is not None:
-            return self.index(self.chaining.options[path.vertices[0]]), -1
-        entry = self.planner.entry(point, event)
-        return GLOBAL, self._event_index(entry.id if entry is not None else event)
+            return self.index(self._first(path)), -1
+        entry = self.planner.entry(point, event) or self.planner.graph.events[event]
+        return self._retrace(point, entry.center, int(entry.id[1:]))
 
-    def _to_goal(self, point: np.ndarray, goal: np.ndarray, failures: int, avoid: str | None) -> tuple[int, int]:
+    def _to_goal(self, point: np.ndarray, goal: np.ndarray, failures: int, avoid: Collection[str]) -> tuple[int, int]:
         """Follow the cheapest way to a goal; after a failed approach, the next cheapest."""
         legs = self.planner.legs(point, goal, avoid)
         if legs:
             path = legs[min(failures, len(legs) - 1)].path
-            return (GLOBAL, -1) if path is None else (self.index(self.chaining.options[path.vertices[0]]), -1)
+            return self._retrace(point, goal, -1) if path is None else (self.index(self._first(path)), -1)
         nearest = self.planner.vertices_near(goal)
         entry = self.planner.entry(point, nearest[0][0].id) if nearest else None
-        return GLOBAL, -1 if entry is None else self._event_index(entry.id)
+        return self._retrace(point, goal, -1) if entry is None else self._retrace(point, entry.center, int(entry.id[1:]))
 
-    def _event_index(self, id: str) -> int:
-        return int(id[1:])
+    def _first(self, path: GraphPath) -> Option:
+        return self.chaining.options[path.vertices[0]]
+
+    def _retrace(self, point: np.ndarray, goal: np.ndarray, aim: int) -> tuple[int, int]:
+        """Walk to a goal by the global option, along a way that has been gone before if there is one."""
+        waypoint = self.planner.waypoint(point, goal)
+        return GLOBAL, aim if waypoint < 0 else -2 - waypoint

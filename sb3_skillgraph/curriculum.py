@@ -103,6 +103,7 @@ class Curriculum:
         self._missions: list[Mission | None] = [None] * n_envs
         self.n_episodes = 0
         self.pinned: str | None = None  # target of few-shot adaptation
+        self._pinned_goal: np.ndarray | None = None  # the same, before it is an event
         self._paths: list[list[np.ndarray]] = [[] for _ in range(n_envs)]  # of the running option
         self._since_event: list[list[np.ndarray]] = [[] for _ in range(n_envs)]  # since the last event was left
         self._last_event: list[str | None] = [None] * n_envs
@@ -124,6 +125,9 @@ class Curriculum:
         if mission is None:
             if not self.graph.events:
                 self._begin(point)
+            if self._pinned_goal is not None:
+                self.pinned = self._pinned_event(self._pinned_goal).id
+                self._pinned_goal = None
             mission = self._missions[env] = self._choose(point)
         if mission.chain is not None and not mission.left_graph:
             source = self.graph.events[self.chaining.chains[mission.chain].source]
@@ -140,15 +144,22 @@ class Curriculum:
         self._last_event = [None] * n_envs
 
     def pin(self, goal: np.ndarray) -> None:
-        """Pursue one goal and nothing else, until ``pinned`` is set to None (section 3.3).
+        """Pursue one goal and nothing else, until :meth:`unpin` (section 3.3); it becomes an event with the next mission.
 
         :param goal: shape ``(goal_dim,)``
         """
+        self._pinned_goal = goal
+
+    def unpin(self) -> None:
+        """Pursue what the agent pursues by itself again."""
+        self.pinned, self._pinned_goal = None, None
+
+    def _pinned_event(self, goal: np.ndarray) -> SalientEvent:
         event = self.planner.event_at(goal)
         if event is None or np.linalg.norm(event.center - goal) > 0.5 * event.radius:
             event = self.discovery.add(goal)
             self._join(event)
-        self.pinned = event.id
+        return event
 
     def _begin(self, point: np.ndarray) -> None:
         """The first event is where the agent starts (section 3.2.7 calls it beta_0)."""
@@ -354,4 +365,5 @@ class Curriculum:
         self.n_episodes, self.pinned = state["n_episodes"], state["pinned"]
         self._paths, self._since_event = state["paths"], state["since_event"]
         self._last_event = state["last_event"]
-        self._events_changed()
+        if self.graph.events:
+            self._events_changed()

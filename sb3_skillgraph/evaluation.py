@@ -115,10 +115,10 @@ def evaluate_pairs(
     :return: success rate, interval and every pair
     :raises ValueError: if the environment has no maze geometry to draw pairs from
     """
+    if not env_id.startswith("SkillGraph/"):
+        raise ValueError(f"evaluate_pairs draws its pairs from a maze: it needs a SkillGraph/* environment, not {env_id!r}.")
     env = gym.make(env_id, **{"terminate_on_success": True, **(env_kwargs or {})})
     try:
-        if not (env.has_wrapper_attr("geometry") and env.has_wrapper_attr("body_radius")):
-            raise ValueError(f"evaluate_pairs draws its pairs from a maze; {env_id!r} has no attribute 'geometry'.")
         drawn = sample_pairs(env.get_wrapper_attr("geometry"), env.get_wrapper_attr("body_radius"), n_pairs, seed)
         env.reset(seed=seed)
         results = []

@@ -48,6 +48,11 @@ class SalientEvent:
         offsets = np.asarray(points, dtype=np.float64) - self.center
         return np.einsum("ij,ij->i", offsets, offsets) <= self.radius**2
 
+    def outline(self) -> np.ndarray:
+        """Return points that stake out the event: its centre, and its rim along every axis; shape ``(n, goal_dim)``."""
+        axes = self.radius * np.eye(len(self.center))
+        return np.concatenate([self.center[None], self.center + axes, self.center - axes])
+
     def get_state(self) -> dict[str, Any]:
         """Return the event as plain data."""
         return {"id": self.id, "center": self.center, "radius": self.radius}

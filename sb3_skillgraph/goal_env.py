@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from gymnasium import spaces
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_skillgraph.options.views import VIEWS, View
 
@@ -31,7 +31,7 @@ class GoalSpec(NamedTuple):
         if not isinstance(observation_space, spaces.Dict) or any(key not in observation_space.spaces for key in KEYS):
             raise ValueError(f"SkillGraphAgent needs a goal environment ({wanted}), not {observation_space}.")
         boxes = [observation_space[key] for key in KEYS]
-        if not all(isinstance(box, spaces.Box) for box in boxes):
+        if not all(isinstance(box, spaces.Box) for box in observation_space.spaces.values()):
             raise ValueError(f"SkillGraphAgent needs {wanted}; this environment has {observation_space}.")
         shapes = [box.shape for box in boxes]
         if shapes[1] != shapes[2] or shapes[1] is None or len(shapes[1]) != 1:
@@ -44,6 +44,19 @@ class GoalSpec(NamedTuple):
             raise ValueError(f"SkillGraphAgent needs an action space with finite bounds, not {action_space}.")
         sizes = [int(np.prod(shape)) for shape in (shapes[0] or (), shapes[1], action_space.shape)]
         return cls(*sizes)
+
+
+def refuse_vec_normalize(env: Any) -> None:
+    """Refuse an environment that normalises its observations.
+
+    :param env: an environment or VecEnv
+    :raises ValueError: if VecNormalize is around it
+    """
+    if isinstance(env, VecEnv) and unwrap_vec_normalize(env) is not None:
+        raise ValueError(
+            "VecNormalize is not supported: events and initiation sets live in raw goal space. Networks see goal space in "
+            "units of the event radius already; remove the wrapper."
+        )
 
 
 def rows(observation: dict[str, np.ndarray], key: str) -> np.ndarray:

@@ -34,7 +34,7 @@ class SkillGraph:
     option, option the effect set of the first lies in the          1 / (success rate times the share of
                    initiation set of the second                     effects inside)
     event, option  the event's trigger points lie in the option's   0 (to be in the event is to be able to
-                   initiation set, or runs begun there succeed      start the option)
+                   initiation set                                   start the option)
     ============== ================================================ ==========================================
 
     *Lies in* means that at least a share ``containment`` of the recent samples do. Every edge carries ``weight`` and
@@ -42,7 +42,8 @@ class SkillGraph:
 
     :param containment: share of samples that must lie inside; 1.0 is the paper's strict rule
     :param rate_prior: pseudo-counts of a success and a failure in every success rate; 0 is the paper's plain fraction
-    :param evidence_edges: whether runs begun in an event and mostly successful make an event-option edge too
+    :param evidence_edges: whether runs begun in an event and mostly successful put the event into the option's
+        initiation set, which makes an event-option edge
     :param min_success_rate: edges whose rate falls below it are dropped, so that no plan uses them
     """
 
@@ -123,8 +124,17 @@ class SkillGraph:
             self._event_option_edge(event.id, option_id, float(share))
 
     def ran_from(self, event: SalientEvent, option: Option, success: bool) -> None:
-        """Remember the outcome of a run that began in an event."""
-        self.evidence.setdefault((event.id, option.id), deque(maxlen=10)).append(success)
+        """Remember the outcome of a run that began in an event.
+
+        While such runs mostly succeed the whole event counts as a place to start the option from, and its initiation
+        set is to hold it.
+        """
+        outcomes = self.evidence.setdefault((event.id, option.id), deque(maxlen=10))
+        outcomes.append(success)
+        if self.evidence_edges:
+            proven = (sum(outcomes) + 1.0) / (len(outcomes) + 2.0) >= 0.5
+            option.initiation.set_region(event.id, event.outline() if proven else None)
+            option.initiation.refit(force=True)
 
     def refresh(self, option: Option, refitted: bool) -> None:
         """Bring the edges of one option up to date after one of its runs.
@@ -143,6 +153,9 @@ class SkillGraph:
         rates = {option.target: rate}
         if option.effects:
             effects = np.stack(option.effects)
+            parent = self.options.get(option.target)
+            if self.containment == 1.0 and parent is not None and not parent.initiation.optimistic(effects).all():
+                del rates[option.target]  # to the letter of the paper; else a chain keeps the edge it was built on
             members, ids = self.bank()
             for share, id in zip(members.contains(effects).mean(axis=0), ids, strict=True):
                 if share >= self.containment and id not in (option.id, option.target):
@@ -163,17 +176,13 @@ class SkillGraph:
         for event_id, points in self.triggers.items():
             self._event_option_edge(event_id, option.id, float(initiation.optimistic(np.stack(points)).mean()))
         for other in self.options.values():
-            if other.effects and other is not option and other.target != option.id:
+            if other.effects and other is not option and (other.target != option.id or self.containment == 1.0):
                 share = float(initiation.optimistic(np.stack(other.effects)).mean())
                 rate = other.success_rate(self.rate_prior) * share if share >= self.containment else 0.0
                 self._set_edge(other.id, option.id, rate)
 
     def _event_option_edge(self, event_id: str, option_id: str, share: float) -> None:
         rate = share if share >= self.containment else 0.0
-        if not rate and self.evidence_edges:
-            outcomes = self.evidence.get((event_id, option_id), ())
-            smoothed = (sum(outcomes) + 1.0) / (len(outcomes) + 2.0)
-            rate = smoothed if outcomes and smoothed >= 0.5 else 0.0
         if self.options[option_id].target == event_id:
             return  # an option does not start where it ends
         self._set_edge(event_id, option_id, rate, weight=0.0)
@@ -209,6 +218,13 @@ class SkillGraph:
         members, ids = self.bank()
         return [ids[i] for i in np.flatnonzero(members.contains(np.asarray(point)[None])[0])]
 
+    def useful(self, point: np.ndarray) -> list[str]:
+        """Return the ids of the options that can start at a point and do not end there at once.
+
+        :param point: shape ``(goal_dim,)``
+        """
+        return [id for id in self.startable(point) if not self.options[id].terminates(np.asarray(point)[None])[0]]
+
     def costs_to(self, target: str) -> dict[str, float]:
         """Return the cost of the cheapest path from every vertex that has one to ``target`` (cached)."""
         return self._tree(target)[0]
@@ -235,6 +251,16 @@ class SkillGraph:
         best = min(reachable, key=lambda source: (costs[source], len(paths[source])))
         vertices = tuple(reversed(paths[best]))
         return GraphPath(vertices, float(costs[best]), self.success_probability(vertices))
+
+    def paths_from(self, sources: Sequence[str]) -> tuple[dict[str, float], dict[str, list[str]]]:
+        """Return cost and path of the cheapest way from any of some vertices to every vertex that has one.
+
+        :param sources: ids of vertices
+        """
+        if not sources:
+            return {}, {}
+        costs, paths = nx.multi_source_dijkstra(self.nx, list(dict.fromkeys(sources)), weight="weight")
+        return costs, paths
 
     def success_probability(self, vertices: Sequence[str]) -> float:
         """Return the product of the success rates along a path."""

@@ -18,6 +18,7 @@ from stable_baselines3.common.utils import check_for_correct_spaces
 from sb3_skillgraph.chaining import DeepSkillChaining
 from sb3_skillgraph.controller import Controller, ControllerState
 from sb3_skillgraph.curriculum import Curriculum
+from sb3_skillgraph.goal_env import refuse_vec_normalize
 from sb3_skillgraph.graph import SkillGraph
 from sb3_skillgraph.options.learner import OptionDDPG, OptionTD3
 from sb3_skillgraph.options.option import Option
@@ -102,6 +103,7 @@ class Persistence(OffPolicyAlgorithm):
         """
         left_out = set(exclude or ()) - set(include or ())
         arguments = {**self._arguments, "event_radius": self.event_radius, "verbose": self.verbose}
+        arguments["action_noise"] = self.action_noise
         if self._view_name is not None:
             arguments["option_view"] = self._view_name
         tree = {
@@ -225,6 +227,7 @@ class Persistence(OffPolicyAlgorithm):
         agent.n_envs = tree["n_envs"]
         if env is not None:
             wrapped = cls._wrap_env(env, agent.verbose)
+            refuse_vec_normalize(wrapped)
             check_for_correct_spaces(wrapped, agent.observation_space, agent.action_space)
             agent.env, agent.n_envs = wrapped, wrapped.num_envs
         agent._setup_model()
@@ -284,6 +287,17 @@ class Persistence(OffPolicyAlgorithm):
         self._held_actions, self._hold_left = progress["held_actions"], progress["hold_left"]
         self._executed = progress["executed"]
         self._env_snapshot = progress["environments"]
+
+    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
+        """
+        Give the agent another environment with the same spaces and the same number of copies.
+
+        :param env: the environment
+        :param force_reset: whether ``learn`` begins at a fresh episode
+        :raises ValueError: if the environment does not fit, or is normalised by VecNormalize
+        """
+        refuse_vec_normalize(env)
+        super().set_env(env, force_reset)
 
     def _restore_env(self) -> bool:
         """Put the environments where they were when the agent was saved, if that is known.
@@ -384,8 +398,9 @@ def _require_callables(arguments: dict[str, Any]) -> None:
 def _describe(space: spaces.Space) -> dict[str, Any]:
     if isinstance(space, spaces.Dict):
         return {"entries": {key: _describe(entry) for key, entry in space.spaces.items()}}
-    assert isinstance(space, spaces.Box)
-    return {"low": space.low, "high": space.high}
+    if isinstance(space, spaces.Box):
+        return {"low": space.low, "high": space.high}
+    raise ValueError(f"A space of this kind cannot be saved: {space}.")
 
 
 def _space(description: dict[str, Any]) -> spaces.Space:

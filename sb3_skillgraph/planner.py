@@ -1,6 +1,6 @@
 """Planning over the skill graph: to an event, and to a goal the agent never saw (sections 3.2.3, 3.2.4, 3.3)."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -67,14 +67,16 @@ class GraphPlanner:
         label = int(self.visited.label(np.asarray(point)[None])[0])
         return None if label < 0 else self.graph.events[f"e{label}"]
 
-    def path_to(self, point: np.ndarray, vertex: str, avoid: str | None = None) -> GraphPath | None:
+    def path_to(self, point: np.ndarray, vertex: str, avoid: Collection[str] = ()) -> GraphPath | None:
         """Find the cheapest way to a vertex that can be started from a point.
 
         :param point: where the agent stands, shape ``(goal_dim,)``
         :param vertex: id of the vertex
-        :param avoid: id of an option that has just failed and is not to be started again
+        :param avoid: ids of options that have failed lately; one of them is started only if nothing else leads there
         """
-        return self.graph.shortest_path([id for id in self.graph.startable(point) if id != avoid], vertex)
+        useful = self.graph.useful(point)
+        path = self.graph.shortest_path([id for id in useful if id not in avoid], vertex)
+        return path if path is not None or not avoid else self.graph.shortest_path(useful, vertex)
 
     def vertices_near(self, goal: np.ndarray) -> list[tuple[SalientEvent, float]]:
         """Rank the events from which a goal is near, nearest first (section 3.2.3).
@@ -96,26 +98,40 @@ class GraphPlanner:
             distances = [(self.graph.events[f"e{index}"], n) for index, n in steps.items()]
         return sorted(distances, key=lambda pair: pair[1])
 
-    def legs(self, point: np.ndarray, goal: np.ndarray, avoid: str | None = None) -> list[Leg]:
+    def legs(self, point: np.ndarray, goal: np.ndarray, avoid: Collection[str] = ()) -> list[Leg]:
         """List the ways to a goal, cheapest first.
 
         :param point: where the agent stands, shape ``(goal_dim,)``
         :param goal: shape ``(goal_dim,)``
-        :param avoid: id of an option that has just failed
+        :param avoid: ids of options that have failed lately
         """
         unit = self.reach if self.nearest == "steps" else 2.0 * self.radius
         legs = []
         steps = self.visited.steps_between(point, goal, 0.5 * self.radius)
         if steps <= self.reach:
             legs.append(Leg(None, None, steps / self.reach))
+        costs, paths = self.graph.paths_from([id for id in self.graph.useful(point) if id not in avoid])
         for event, distance in self.vertices_near(goal):
             if event.contains(point[None])[0]:
                 legs.append(Leg(None, None, distance / unit))
-                continue
-            path = self.path_to(point, event.id, avoid)
-            if path is not None:
+            elif event.id in costs:
+                vertices = tuple(paths[event.id])
+                path = GraphPath(vertices, costs[event.id], self.graph.success_probability(vertices))
                 legs.append(Leg(event.id, path, path.cost + distance / unit))
         return sorted(legs, key=lambda leg: leg.cost)
+
+    def waypoint(self, point: np.ndarray, goal: np.ndarray) -> int:
+        """Return the next point on the way that a trajectory took from near one point to near another.
+
+        The global option sees no walls; it is sent along ways that have been gone before, a stretch at a time.
+
+        :param point: where the agent stands, shape ``(goal_dim,)``
+        :param goal: shape ``(goal_dim,)``
+        :return: index of a visited point; ``-1`` for the goal itself
+        """
+        if self.nearest == "euclidean":
+            return -1
+        return self.visited.waypoint(point, goal, self.radius, self.reach // 2)
 
     def entry(self, point: np.ndarray, target: str | None) -> SalientEvent | None:
         """Return the event by which to enter the graph from a point outside.
@@ -158,7 +174,7 @@ class GraphPlanner:
         path = legs[0].path
         if path is None:
             here = self.event_at(point)
-            return Plan(status, () if here is None else (here.id,), 0.0, 1.0)
+            return Plan(status, (), float("inf"), 0.0) if here is None else Plan(status, (here.id,), 0.0, 1.0)
         return Plan(status, path.vertices, path.cost, path.success_probability)
 
     def coverage(self, n_samples: int = 500) -> float:

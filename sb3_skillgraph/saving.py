@@ -27,6 +27,7 @@ _CLASSES: dict[str, type] = {
     for cls in (
         *(DDPG, TD3, SAC, noise.NormalActionNoise, noise.OrnsteinUhlenbeckActionNoise, noise.VectorizedActionNoise),
         *(th.nn.ReLU, th.nn.LeakyReLU, th.nn.ELU, th.nn.GELU, th.nn.SiLU, th.nn.Tanh, th.nn.Sigmoid, th.nn.Softplus),
+        *(np.float32, np.float64),
         *(th.optim.Adam, th.optim.AdamW, th.optim.SGD, th.optim.RMSprop),
     )
 }

@@ -130,19 +130,20 @@ class VisitedStates:
             nearest[inside] = squared[inside]
         return best
 
-    def near(self, point: np.ndarray, radius: float) -> np.ndarray:
+    def near(self, point: np.ndarray, radius: float, exact: bool = False) -> np.ndarray:
         """Return the indices of visited points within ``radius`` of a point; of the nearest one if there are none.
 
         :param point: shape ``(goal_dim,)``
         :param radius: distance in goal units
-        :return: int array, empty only while nothing has been visited
+        :param exact: return none if there are none
+        :return: int array
         """
         if self.size == 0:
             return np.zeros(0, dtype=np.int64)
         offsets = self.points - np.asarray(point, dtype=np.float32)
         squared = np.einsum("ij,ij->i", offsets, offsets)
         inside = np.flatnonzero(squared <= radius**2)
-        return inside if len(inside) else squared.argmin(keepdims=True)
+        return inside if len(inside) or exact else squared.argmin(keepdims=True)
 
     def _events_passed(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """For each point: the last event before it on its trajectory, steps since; the next one, steps until."""
@@ -194,19 +195,46 @@ class VisitedStates:
         :param radius: how near a trajectory must come, in goal units
         :return: environment steps; ``inf`` if no trajectory passed both in this order
         """
-        if self.size == 0:
-            return float("inf")
-        here, there = self.near(start, radius), self.near(goal, radius)
+        here, there = self.near(start, radius, exact=True), self.near(goal, radius, exact=True)
+        departure, arrival = self._passage(here, there)
+        return float("inf") if departure < 0 else float(self._step[arrival] - self._step[departure])
+
+    def waypoint(self, start: np.ndarray, goal: np.ndarray, radius: float, ahead: int) -> int:
+        """Find the next point to walk to on the quickest way any trajectory took from near one point to near another.
+
+        :param start: shape ``(goal_dim,)``
+        :param goal: shape ``(goal_dim,)``
+        :param radius: how near a trajectory must come, and how far the waypoint must be from the start at least
+        :param ahead: environment steps the trajectory took to the waypoint at least
+        :return: index of a visited point; ``-1`` if the goal itself is as near, or no trajectory leads there
+        """
+        departure, arrival = self._passage(self.near(start, radius), self.near(goal, radius))
+        if departure < 0:
+            return -1
+        step, trajectory = self._step[: self.size], self._trajectory[: self.size]
+        way = (trajectory == trajectory[departure]) & (step >= step[departure] + ahead) & (step < step[arrival])
+        indices = np.flatnonzero(way)
+        far = np.linalg.norm(self.points[indices] - start, axis=1) > radius
+        indices = indices[far]
+        return int(indices[step[indices].argmin()]) if len(indices) else -1
+
+    def _passage(self, here: np.ndarray, there: np.ndarray) -> tuple[int, int]:
+        """Return from which of some points to which of others a trajectory went quickest, ``-1`` if none did."""
+        if len(here) == 0 or len(there) == 0:
+            return -1, -1
         # One sortable key for (trajectory, step): the first passage of the goal after each passage of the start.
         span = int(self._step[: self.size].max()) + 1
-        there_key = np.sort(self._trajectory[there] * span + self._step[there])
-        here_key = self._trajectory[here] * span + self._step[here]
-        following = np.searchsorted(there_key, here_key)
-        found = following < len(there_key)
-        arrival = there_key[following[found]]
-        departure = here_key[found]
-        same = arrival // span == departure // span
-        return float((arrival - departure)[same].min()) if same.any() else float("inf")
+        key = self._trajectory[: self.size] * span + self._step[: self.size]
+        there = there[np.argsort(key[there], kind="stable")]
+        following = np.searchsorted(key[there], key[here])
+        here, following = here[following < len(there)], following[following < len(there)]
+        arrivals = there[following]
+        same = self._trajectory[here] == self._trajectory[arrivals]
+        here, arrivals = here[same], arrivals[same]
+        if len(here) == 0:
+            return -1, -1
+        best = int((self._step[arrivals] - self._step[here]).argmin())
+        return int(here[best]), int(arrivals[best])
 
     def path_from(self, event: int, point: np.ndarray, radius: float) -> np.ndarray:
         """Return the quickest way any trajectory took from an event to near a point.
@@ -234,7 +262,9 @@ class VisitedStates:
         :param max_steps: environment steps
         :return: index of a visited point on the same trajectory, not later than ``index``
         """
-        _, steps, _, _ = self._events_passed()
+        event, steps, _, _ = self._events_passed()
+        if event[index] < 0:
+            return index
         n = self.size
         same = np.flatnonzero(
             (self._trajectory[:n] == self._trajectory[index])

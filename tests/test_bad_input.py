@@ -401,9 +401,7 @@ def check_old_files_stay(agent: SkillGraphAgent, folder: Path, error: type[BaseE
     assert differences(state, state_of(agent)) == []
 
 
-def test_old_file_stays_if_renaming_fails(
-    trained: SkillGraphAgent, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_old_file_stays_if_renaming_fails(trained: SkillGraphAgent, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     save_both(trained, tmp_path)
 
     def fail(*_: Any, **__: Any) -> None:

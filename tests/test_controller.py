@@ -192,9 +192,7 @@ def test_what_failed_is_remembered_until_something_else_ends(line: World) -> Non
     assert (running.avoid.tolist(), running.failures.tolist()) == ([O1], [0])
     succeeded, _ = line.controller.advance(running._replace(option=np.array([O2])), at(20.0), request)
     assert succeeded.avoid.tolist() == [-1]
-    walked, _ = line.controller.advance(
-        running._replace(option=np.array([GLOBAL]), steps=np.array([5])), at(5.0), request
-    )
+    walked, _ = line.controller.advance(running._replace(option=np.array([GLOBAL]), steps=np.array([5])), at(5.0), request)
     assert (walked.avoid.tolist(), walked.failures.tolist()) == ([-1], [1])
 
 

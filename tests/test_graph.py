@@ -87,9 +87,7 @@ def test_an_event_leads_into_an_option_at_no_cost_but_never_into_one_that_ends_t
 
 
 @pytest.mark.parametrize(("containment", "outside", "joined"), [(1.0, 1, False), (0.9, 1, True), (0.9, 2, False)])
-def test_an_event_leads_into_an_option_while_its_triggers_lie_inside(
-    containment: float, outside: int, joined: bool
-) -> None:
+def test_an_event_leads_into_an_option_while_its_triggers_lie_inside(containment: float, outside: int, joined: bool) -> None:
     graph = two_events(containment=containment, evidence_edges=False)
     graph.add_option(leads_to_e1(start=((-0.5, 0.0), 1.0)))
     for _ in range(10):

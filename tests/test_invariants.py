@@ -214,9 +214,7 @@ def test_an_edge_exists_only_while_its_test_holds(mode: str, sequence: list[tupl
 @every_mode
 @given(operations)
 @profile(6, shrink=False)
-def test_paths_are_paths_of_the_graph_that_can_be_begun(
-    mode: str, sequence: list[tuple[str, int, float, float]]
-) -> None:
+def test_paths_are_paths_of_the_graph_that_can_be_begun(mode: str, sequence: list[tuple[str, int, float, float]]) -> None:
     history = History(mode)
     for k, operation in enumerate(sequence):
         history.apply(*operation)

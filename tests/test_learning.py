@@ -188,9 +188,7 @@ def test_goals_of_three_dimensions(tmp_path: Any, extra: bool) -> None:
     calls=st.lists(st.tuples(st.integers(1, 70), st.booleans(), st.integers(1, 90)), min_size=1, max_size=4),
     max_steps=st.integers(5, 40),
 )
-def test_every_transition_is_in_the_store_once(
-    n_envs: int, calls: list[tuple[int, bool, int]], max_steps: int
-) -> None:
+def test_every_transition_is_in_the_store_once(n_envs: int, calls: list[tuple[int, bool, int]], max_steps: int) -> None:
     recorders = [Recorder(gym.make(TOY, max_steps=max_steps)) for _ in range(n_envs)]
     agent = new_agent(DummyVecEnv([lambda env=env: env for env in recorders]), learning_starts=30)
     for n_steps, reset_num_timesteps, stop_at in calls:

@@ -119,8 +119,7 @@ def test_large_networks_are_sb3s(ours, stock):
     b = make(stock, [400, 300], n_obs=31, n_act=8)
     b.policy.load_state_dict(a.policy.state_dict())
     b._update_learning_rate = lambda optimizers: [
-        optimizer.param_groups[0].update(lr=rate)
-        for optimizer, rate in zip(optimizers, (ACTOR_LR, CRITIC_LR), strict=True)
+        optimizer.param_groups[0].update(lr=rate) for optimizer, rate in zip(optimizers, (ACTOR_LR, CRITIC_LR), strict=True)
     ]
     for model in (a, b):
         train(model, 20, batch_size=64)

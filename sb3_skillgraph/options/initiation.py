@@ -55,6 +55,7 @@ class InitiationSet:
         self.radius = radius
         self.successes: deque[np.ndarray] = deque(maxlen=N_SUCCESSES)
         self.failures: deque[np.ndarray] = deque(maxlen=N_FAILURES)
+        self.regions: dict[str, np.ndarray] = {}
         self.optimistic_boundaries: list[Boundary] = []
         self.pessimistic_boundaries: list[Boundary] = []
         self.core: np.ndarray | None = None
@@ -82,6 +83,18 @@ class InitiationSet:
         self.failures.append(np.asarray(start, dtype=np.float64))
         self._n_news += 1
 
+    def set_region(self, name: str, points: np.ndarray | None) -> None:
+        """Count a whole region as a place to start from, or no longer.
+
+        :param name: name of the region (an event's id)
+        :param points: points that stake it out, shape ``(n, goal_dim)``; None to take it away
+        """
+        if points is None:
+            self._n_news += self.regions.pop(name, None) is not None
+        else:
+            self._n_news += name not in self.regions
+            self.regions[name] = np.asarray(points, dtype=np.float64)
+
     def refit(self, force: bool = False) -> bool:
         """Fit the set to its examples, if enough of them are new.
 
@@ -92,7 +105,7 @@ class InitiationSet:
         if not known or not (force or self._n_news * 5 >= known):
             return False
         self._n_news = 0
-        positives = np.concatenate(self.successes)
+        positives = np.concatenate([*self.successes, *self.regions.values()])
         negatives = self._standing_failures()
         # A floor under the kernel's width: a handful of points in one spot still describe a place, not a point.
         gamma = 1.0 / (positives.shape[1] * max(float(positives.var()), (0.5 * self.radius) ** 2))
@@ -147,6 +160,7 @@ class InitiationSet:
         return {
             "successes": list(self.successes),
             "failures": list(self.failures),
+            "regions": self.regions,
             "optimistic": [boundary._asdict() for boundary in self.optimistic_boundaries],
             "pessimistic": [boundary._asdict() for boundary in self.pessimistic_boundaries],
             "core": self.core,
@@ -157,6 +171,7 @@ class InitiationSet:
         """Restore what :meth:`get_state` returned."""
         self.successes = deque(state["successes"], maxlen=N_SUCCESSES)
         self.failures = deque(state["failures"], maxlen=N_FAILURES)
+        self.regions = dict(state["regions"])
         self.optimistic_boundaries = [Boundary(**boundary) for boundary in state["optimistic"]]
         self.pessimistic_boundaries = [Boundary(**boundary) for boundary in state["pessimistic"]]
         self.core = state["core"]
