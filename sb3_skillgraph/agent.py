@@ -51,6 +51,7 @@ PAPER: dict[str, Any] = dict(
     min_success_rate=0.0,
     nearest="euclidean",
     hindsight=0.0,
+    goal_tolerance=1.0,
     shared_experience=0.0,
     warm_start=False,
     global_update_fraction=0.0,
@@ -102,6 +103,8 @@ class SkillGraphAgent(Assembly):
         them learn from scratch
     :param global_update_fraction: share of the updates that goes to the global option; executed options share the rest
     :param hindsight: share of sampled transitions relabelled with a goal achieved later
+    :param goal_tolerance: how near the global option must come to a goal, and any option to one put in by hindsight, for
+        it to learn that it has reached it; in event radii
     :param shared_experience: share of an option's batches drawn from all experience rather than its own runs
     :param salience: how events are proposed: ``"frontier"`` (visited states), ``"rrt"`` (uniform feasible states from
         the environment's ``sample_free``) or an object with ``propose(rng)`` [3.2.1]
@@ -170,6 +173,7 @@ class SkillGraphAgent(Assembly):
         warm_start: bool = True,
         global_update_fraction: float = 0.5,
         hindsight: float = 0.8,
+        goal_tolerance: float = 0.5,
         shared_experience: float = 0.5,
         salience: Literal["frontier", "rrt"] | Salience = "frontier",
         salient_event_freq: int = 30,
@@ -282,7 +286,7 @@ class SkillGraphAgent(Assembly):
             first, self._last_obs = self._last_obs, None
             assert isinstance(first, dict)
             check_finite(first, self.num_timesteps)
-            self._last_obs = first  # type: ignore[assignment]
+            self._last_obs = first
             self._begin_episodes()
             self.store.cut()
             self.visited.cut(self.n_envs)

@@ -53,6 +53,7 @@ class Assembly(Persistence):
             self.view,
             self._action_space(),
             self.event_radius,
+            args["goal_tolerance"] * self.event_radius,
             self.rng,
             dict(hindsight=args["hindsight"], shared=args["shared_experience"], horizon=args["option_timeout"]),
             self.device,
@@ -110,6 +111,7 @@ class Assembly(Persistence):
             self.planner,
             self.view,
             self.event_radius,
+            args["goal_tolerance"] * self.event_radius,
             args["option_timeout"],
             args["warm_start"],
         )

@@ -91,6 +91,7 @@ class Controller:
     :param planner: finds ways over the graph
     :param view: what a policy sees
     :param radius: the event radius, in goal units
+    :param tolerance: distance within which a waypoint counts as reached, in goal units
     :param timeout: environment steps an option may run; the global option, half of them
     :param warm_start: whether gestating options act with the global option's policy
 
@@ -104,6 +105,7 @@ class Controller:
         planner: GraphPlanner,
         view: View,
         radius: float,
+        tolerance: float,
         timeout: int,
         warm_start: bool,
     ) -> None:
@@ -112,6 +114,7 @@ class Controller:
         self.planner = planner
         self.view = view
         self.radius = radius
+        self.tolerance = tolerance
         self.timeout = timeout
         self.warm_start = warm_start
         self.planning = True
@@ -163,7 +166,9 @@ class Controller:
             termination = self.option(index).termination
             assert termination is not None
             return termination
-        return self.event(aim) if aim >= 0 else SalientEvent("goal", self._aim(index, aim, request), self.radius)
+        if aim >= 0:
+            return self.event(aim)
+        return SalientEvent("goal", self._aim(index, aim, request), self.radius if aim == -1 else self.tolerance)
 
     def act(
         self,
@@ -222,42 +227,44 @@ class Controller:
             return GLOBAL, -1
         avoid = [self.option(index).id for index in failed if index > GLOBAL]
         if request.chain is not None:
-            return self._practise(point, request, avoid)
+            return self._practise(point, request, failures, avoid)
         if request.event is not None:
-            return self._towards(point, request.event, avoid)
+            return self._towards(point, request.event, failures, avoid)
         return self._to_goal(point, request.goal, failures, avoid)
 
-    def _practise(self, point: np.ndarray, request: Request, avoid: Collection[str]) -> tuple[int, int]:
+    def _practise(self, point: np.ndarray, request: Request, failures: int, avoid: Collection[str]) -> tuple[int, int]:
         """Plan to the chain's source; from there on, the chain's earliest admissible option (section 3.2.5)."""
         assert request.chain is not None
         chain = self.chaining.chains[request.chain]
         source = self.planner.graph.events[chain.source]
         if request.left_graph or source.contains(point[None])[0]:
             return self.index(self.chaining.admissible(chain, point)), -1
-        return self._towards(point, source.id, avoid)
+        return self._towards(point, source.id, failures, avoid)
 
-    def _towards(self, point: np.ndarray, event: str, avoid: Collection[str]) -> tuple[int, int]:
+    def _towards(self, point: np.ndarray, event: str, failures: int, avoid: Collection[str]) -> tuple[int, int]:
         """Follow the plan to an event; outside the graph, walk to where it can be entered."""
         path = self.planner.path_to(point, event, avoid)
         if path is not None:
             return self.index(self._first(path)), -1
         entry = self.planner.entry(point, event) or self.planner.graph.events[event]
-        return self._retrace(point, entry.center, int(entry.id[1:]))
+        return self._retrace(point, entry.center, int(entry.id[1:]), failures)
 
     def _to_goal(self, point: np.ndarray, goal: np.ndarray, failures: int, avoid: Collection[str]) -> tuple[int, int]:
         """Follow the cheapest way to a goal; after a failed approach, the next cheapest."""
         legs = self.planner.legs(point, goal, avoid)
         if legs:
             path = legs[min(failures, len(legs) - 1)].path
-            return self._retrace(point, goal, -1) if path is None else (self.index(self._first(path)), -1)
+            return self._retrace(point, goal, -1, failures) if path is None else (self.index(self._first(path)), -1)
         nearest = self.planner.vertices_near(goal)
         entry = self.planner.entry(point, nearest[0][0].id) if nearest else None
-        return self._retrace(point, goal, -1) if entry is None else self._retrace(point, entry.center, int(entry.id[1:]))
+        if entry is None:
+            return self._retrace(point, goal, -1, failures)
+        return self._retrace(point, entry.center, int(entry.id[1:]), failures)
 
     def _first(self, path: GraphPath) -> Option:
         return self.chaining.options[path.vertices[0]]
 
-    def _retrace(self, point: np.ndarray, goal: np.ndarray, aim: int) -> tuple[int, int]:
+    def _retrace(self, point: np.ndarray, goal: np.ndarray, aim: int, failures: int) -> tuple[int, int]:
         """Walk to a goal by the global option, along a way that has been gone before if there is one."""
-        waypoint = self.planner.waypoint(point, goal)
+        waypoint = self.planner.waypoint(point, goal, failures)
         return GLOBAL, aim if waypoint < 0 else -2 - waypoint

@@ -2,7 +2,7 @@
 
 import itertools
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from typing import Any, NamedTuple
 
 import networkx as nx
@@ -252,14 +252,17 @@ class SkillGraph:
         vertices = tuple(reversed(paths[best]))
         return GraphPath(vertices, float(costs[best]), self.success_probability(vertices))
 
-    def paths_from(self, sources: Sequence[str]) -> tuple[dict[str, float], dict[str, list[str]]]:
+    def paths_from(self, sources: Sequence[str], avoid: Collection[str] = ()) -> tuple[dict[str, float], dict[str, list[str]]]:
         """Return cost and path of the cheapest way from any of some vertices to every vertex that has one.
 
         :param sources: ids of vertices
+        :param avoid: ids of vertices that no way may lead through
         """
+        sources = [id for id in dict.fromkeys(sources) if id not in avoid]
         if not sources:
             return {}, {}
-        costs, paths = nx.multi_source_dijkstra(self.nx, list(dict.fromkeys(sources)), weight="weight")
+        graph = nx.restricted_view(self.nx, [id for id in avoid if id in self.nx], []) if avoid else self.nx
+        costs, paths = nx.multi_source_dijkstra(graph, sources, weight="weight")
         return costs, paths
 
     def success_probability(self, vertices: Sequence[str]) -> float:

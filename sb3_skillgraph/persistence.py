@@ -10,6 +10,7 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.noise import VectorizedActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.save_util import recursive_getattr
 from stable_baselines3.common.type_aliases import GymEnv
@@ -230,6 +231,9 @@ class Persistence(OffPolicyAlgorithm):
             refuse_vec_normalize(wrapped)
             check_for_correct_spaces(wrapped, agent.observation_space, agent.action_space)
             agent.env, agent.n_envs = wrapped, wrapped.num_envs
+        noise = agent.action_noise
+        if isinstance(noise, VectorizedActionNoise) and noise.n_envs != agent.n_envs:
+            agent.action_noise = noise.base_noise
         agent._setup_model()
         agent._restore(tree, same_envs=agent.n_envs == tree["n_envs"] and not force_reset)
         return agent

@@ -1,6 +1,6 @@
 """Planning over the skill graph: to an event, and to a goal the agent never saw (sections 3.2.3, 3.2.4, 3.3)."""
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -11,6 +11,9 @@ from sb3_skillgraph.visited import VisitedStates
 
 _Table = Callable[[np.ndarray, float], dict[int, int]]
 Status = Literal["in_graph", "in_initiation_set", "outside"]
+
+
+RETRACING = 2.0  # option runs that a long way retraced costs per option run's length
 
 
 class Plan(NamedTuple):
@@ -72,11 +75,17 @@ class GraphPlanner:
 
         :param point: where the agent stands, shape ``(goal_dim,)``
         :param vertex: id of the vertex
-        :param avoid: ids of options that have failed lately; one of them is started only if nothing else leads there
+        :param avoid: ids of options that have failed lately; they are run only if nothing else leads there
         """
         useful = self.graph.useful(point)
-        path = self.graph.shortest_path([id for id in useful if id not in avoid], vertex)
-        return path if path is not None or not avoid else self.graph.shortest_path(useful, vertex)
+        if avoid:
+            costs, paths = self.graph.paths_from(useful, avoid)
+            if vertex in costs:
+                return self._path(paths[vertex], costs[vertex])
+        return self.graph.shortest_path(useful, vertex)
+
+    def _path(self, vertices: Sequence[str], cost: float) -> GraphPath:
+        return GraphPath(tuple(vertices), cost, self.graph.success_probability(vertices))
 
     def vertices_near(self, goal: np.ndarray) -> list[tuple[SalientEvent, float]]:
         """Rank the events from which a goal is near, nearest first (section 3.2.3).
@@ -108,30 +117,31 @@ class GraphPlanner:
         unit = self.reach if self.nearest == "steps" else 2.0 * self.radius
         legs = []
         steps = self.visited.steps_between(point, goal, 0.5 * self.radius)
-        if steps <= self.reach:
-            legs.append(Leg(None, None, steps / self.reach))
-        costs, paths = self.graph.paths_from([id for id in self.graph.useful(point) if id not in avoid])
+        if np.isfinite(steps):
+            # Beyond the reach of one option, plans are surer than a long way retraced.
+            legs.append(Leg(None, None, steps / self.reach * (1.0 if steps <= self.reach else RETRACING)))
+        costs, paths = self.graph.paths_from(self.graph.useful(point), avoid)
         for event, distance in self.vertices_near(goal):
             if event.contains(point[None])[0]:
                 legs.append(Leg(None, None, distance / unit))
             elif event.id in costs:
-                vertices = tuple(paths[event.id])
-                path = GraphPath(vertices, costs[event.id], self.graph.success_probability(vertices))
+                path = self._path(paths[event.id], costs[event.id])
                 legs.append(Leg(event.id, path, path.cost + distance / unit))
         return sorted(legs, key=lambda leg: leg.cost)
 
-    def waypoint(self, point: np.ndarray, goal: np.ndarray) -> int:
+    def waypoint(self, point: np.ndarray, goal: np.ndarray, failures: int) -> int:
         """Return the next point on the way that a trajectory took from near one point to near another.
 
         The global option sees no walls; it is sent along ways that have been gone before, a stretch at a time.
 
         :param point: where the agent stands, shape ``(goal_dim,)``
         :param goal: shape ``(goal_dim,)``
+        :param failures: approaches that have failed; after one, stretches are shorter
         :return: index of a visited point; ``-1`` for the goal itself
         """
         if self.nearest == "euclidean":
             return -1
-        return self.visited.waypoint(point, goal, self.radius, self.reach // 2)
+        return self.visited.waypoint(point, goal, 0.5 * self.radius, self.reach // (6 if failures else 3))
 
     def entry(self, point: np.ndarray, target: str | None) -> SalientEvent | None:
         """Return the event by which to enter the graph from a point outside.

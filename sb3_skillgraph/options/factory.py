@@ -24,6 +24,7 @@ class OptionFactory:
     :param view: what a policy sees
     :param action_space: action space of the environment
     :param radius: the event radius, in goal units
+    :param tolerance: distance within which the global option's goals and those put in by hindsight are reached
     :param rng: random generator
     :param replay_kwargs: ``hindsight``, ``shared`` and ``horizon`` of :class:`OptionReplay`
     :param device: torch device
@@ -37,6 +38,7 @@ class OptionFactory:
         view: ScaledView,
         action_space: spaces.Box,
         radius: float,
+        tolerance: float,
         rng: np.random.Generator,
         replay_kwargs: dict[str, Any],
         device: th.device,
@@ -47,6 +49,7 @@ class OptionFactory:
         self.view = view
         self.action_space = action_space
         self.radius = radius
+        self.tolerance = tolerance
         self.rng = rng
         self.replay_kwargs = replay_kwargs
         self.device = device
@@ -67,7 +70,7 @@ class OptionFactory:
         :return: the option, gestating
         """
         everything = termination is None
-        rule = goal_rule(self.radius) if termination is None else termination_rule(termination, self.radius)
+        rule = goal_rule(self.tolerance) if termination is None else termination_rule(termination, self.tolerance)
         replay = OptionReplay(
             self.store,
             self.view,
