@@ -1,9 +1,10 @@
 """Deep Skill Graphs for Stable-Baselines3."""
 
 from sb3_skillgraph import envs  # registers the environments
-from sb3_skillgraph.agent import PAPER, SkillGraphAgent
+from sb3_skillgraph.agent import SkillGraphAgent
 from sb3_skillgraph.evaluation import evaluate_pairs
 from sb3_skillgraph.options.env import OptionEnv
+from sb3_skillgraph.paper import PAPER
 from sb3_skillgraph.version import __version__
 
 __all__ = ["PAPER", "OptionEnv", "SkillGraphAgent", "__version__", "envs", "evaluate_pairs"]

@@ -5,7 +5,6 @@ from typing import Any, ClassVar, Literal, NamedTuple, TypeVar
 
 import numpy as np
 import torch as th
-from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
@@ -15,8 +14,8 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.td3.policies import MultiInputPolicy
 
 from sb3_skillgraph.assembly import Assembly
-from sb3_skillgraph.controller import GLOBAL, UNDECIDED, ControllerState, Request
-from sb3_skillgraph.goal_env import KEYS, GoalSpec, check_finite, refuse_vec_normalize, rows
+from sb3_skillgraph.controller import GLOBAL, ControllerState, Request
+from sb3_skillgraph.goal_env import KEYS, GoalSpec, as_batch, as_goal, check_finite, refuse_vec_normalize, rows, with_terminal
 from sb3_skillgraph.interrupts import uninterrupted
 from sb3_skillgraph.options.learner import OptionDDPG
 from sb3_skillgraph.options.option import Option
@@ -25,37 +24,6 @@ from sb3_skillgraph.planner import Plan
 from sb3_skillgraph.salience.proposals import Salience
 
 SelfSkillGraphAgent = TypeVar("SelfSkillGraphAgent", bound="SkillGraphAgent")
-
-#: The paper as written: one DDPG per option learned from its own experience, strict sets, uniform targets (Table 1, A).
-PAPER: dict[str, Any] = dict(
-    batch_size=64,
-    tau=0.01,
-    gamma=0.99,
-    policy_kwargs=dict(net_arch=[400, 300]),
-    option_kwargs=dict(actor_learning_rate=1e-4, critic_learning_rate=1e-3),
-    salience="rrt",
-    salient_event_freq=30,
-    retry_after=10,
-    events_per_attempt=2,
-    event_tries=1,
-    max_unconnected=None,
-    gestation_period=3,
-    practice_runs=0,
-    target_choice="uniform",
-    max_failures=None,
-    link_reach=0,
-    off_policy_runs=False,
-    containment=1.0,
-    evidence_edges=False,
-    rate_prior=0.0,
-    min_success_rate=0.0,
-    nearest="euclidean",
-    hindsight=0.0,
-    goal_tolerance=1.0,
-    shared_experience=0.0,
-    warm_start=False,
-    global_update_fraction=0.0,
-)
 
 
 class SkillGraphAgent(Assembly):
@@ -102,6 +70,7 @@ class SkillGraphAgent(Assembly):
     :param warm_start: gestating options act with the global option's policy and copy it when they mature; False lets
         them learn from scratch
     :param global_update_fraction: share of the updates that goes to the global option; executed options share the rest
+        (which the global option takes too while none of them is to be trained)
     :param hindsight: share of sampled transitions relabelled with a goal achieved later
     :param goal_tolerance: how near the global option must come to a goal, and any option to one put in by hindsight, for
         it to learn that it has reached it; in event radii
@@ -147,7 +116,7 @@ class SkillGraphAgent(Assembly):
         batch_size: int = 128,
         tau: float = 0.005,
         gamma: float = 0.98,
-        train_freq: int | tuple[int, str] = 1,
+        train_freq: int | tuple[int, str] = 2,
         gradient_steps: int = 1,
         action_noise: ActionNoise | None = None,
         replay_buffer_class: type[ReplayBuffer] | None = None,
@@ -301,7 +270,7 @@ class SkillGraphAgent(Assembly):
         assert isinstance(self._last_obs, dict)
         points = rows(self._last_obs, "achieved_goal")
         for i in range(self.n_envs):
-            self.curriculum.assign(i, points[i])
+            self.curriculum.assign(i, points[i], warm_up=self.num_timesteps < self.learning_starts)
 
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
@@ -312,13 +281,11 @@ class SkillGraphAgent(Assembly):
         observation = {key: rows(self._last_obs, key) for key in KEYS}
         requests = [mission.request for mission in self.curriculum.missions]
         scaled, aims, state = self.controller.act(observation, self._state, requests)
-        scaled, held, hold_left = self._explore(scaled, learning_starts, action_noise)
+        scaled, held, hold_left = self._explore(scaled, action_noise)
         self._pending = _Pending(observation, scaled, aims, state, held, hold_left, rng_state)
         return self._factory.unscale(scaled).reshape((n_envs, *self._action_space().shape)), scaled
 
-    def _explore(
-        self, scaled: np.ndarray, learning_starts: int, action_noise: ActionNoise | None
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _explore(self, scaled: np.ndarray, action_noise: ActionNoise | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Add noise, or replace an action by a random one that is held for some steps."""
         if action_noise is not None:
             scaled = scaled + action_noise()
@@ -326,8 +293,7 @@ class SkillGraphAgent(Assembly):
             scaled = scaled + self.rng.normal(0.0, self._exploration_noise, scaled.shape)
         held, hold_left = self._held_actions.copy(), self._hold_left.copy()
         for i, mission in enumerate(self.curriculum.missions):
-            walking = mission.random_walk or self.num_timesteps < learning_starts
-            if hold_left[i] == 0 and (walking or self.rng.random() < self._random_action_prob / self._random_hold):
+            if hold_left[i] == 0 and (mission.random_walk or self.rng.random() < self._random_action_prob / self._random_hold):
                 held[i] = self.rng.uniform(-1.0, 1.0, held[i].shape)
                 hold_left[i] = self.rng.integers(1, 2 * self._random_hold)
             if hold_left[i] > 0:
@@ -346,7 +312,7 @@ class SkillGraphAgent(Assembly):
     ) -> None:
         """Store the step once, and let everything learn from it."""
         assert isinstance(new_obs, dict)
-        reached = _with_terminal(new_obs, dones, infos)
+        reached = with_terminal(new_obs, dones, infos)
         if self._reset_options:
             new_obs = self._start_over(new_obs, dones)
         check_finite(new_obs, self.num_timesteps)
@@ -395,8 +361,9 @@ class SkillGraphAgent(Assembly):
                 self.controller.option(index).replay.add_rows(row[i : i + 1])
             self.visited.record(i, self.num_timesteps, points[i], bool(dones[i]))
             if self.curriculum.observe(i, before[i], points[i], by_env.get(i), bool(dones[i])):
-                self._state.option[i] = UNDECIDED
-                self._state.failures[i], self._state.failed_last[i], self._state.failed_before[i] = 0, -1, -1
+                fresh = ControllerState.fresh(1)
+                for kept, forgotten in zip(self._state, fresh, strict=True):
+                    kept[i] = forgotten[0]
             if dones[i]:
                 self._hold_left[i] = 0
 
@@ -475,7 +442,7 @@ class SkillGraphAgent(Assembly):
         :return: actions in the environment's own bounds, and the state
         :raises ValueError: if the observation does not fit the observation space
         """
-        batch, vectorized = self._batch(observation)
+        batch, vectorized = as_batch(observation, self.observation_space)
         n_envs = len(batch["achieved_goal"])
         running = ControllerState.fresh(n_envs) if state is None else ControllerState(*state).copy()
         if episode_start is not None:
@@ -489,24 +456,6 @@ class SkillGraphAgent(Assembly):
         actions = self._factory.unscale(scaled).reshape((n_envs, *self._action_space().shape))
         return (actions if vectorized else actions[0]), tuple(running)
 
-    def _batch(self, observation: np.ndarray | dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], bool]:
-        if not isinstance(observation, dict) or any(key not in observation for key in KEYS):
-            raise ValueError(f"predict needs a Dict observation with {', '.join(KEYS)}, not {type(observation).__name__}.")
-        space = self.observation_space
-        assert isinstance(space, spaces.Dict)
-        given = np.shape(observation["achieved_goal"])
-        expected = space["achieved_goal"].shape
-        assert expected is not None
-        vectorized = len(given) > len(expected)
-        batch = {}
-        for key in KEYS:
-            array = np.asarray(observation[key], dtype=np.float32)
-            shape = space[key].shape
-            if array.shape[int(vectorized) :] != shape:
-                raise ValueError(f"{key!r} has shape {array.shape}; expected {shape}, or the same with a leading axis.")
-            batch[key] = array.reshape(len(array) if vectorized else 1, -1)
-        return batch, vectorized
-
     def plan(self, obs: dict[str, np.ndarray], goal: np.ndarray | None = None) -> Plan:
         """
         Tell how the agent would go about a goal (section 3.3, Figure 2).
@@ -516,18 +465,9 @@ class SkillGraphAgent(Assembly):
         :return: which of the paper's three cases holds, and the path
         :raises ValueError: if the goal is not a finite vector of goal space
         """
-        batch, _ = self._batch(obs)
-        target = batch["desired_goal"][0] if goal is None else self._checked_goal(goal)
+        batch, _ = as_batch(obs, self.observation_space)
+        target = batch["desired_goal"][0] if goal is None else as_goal(goal, self._spec.goal_dim)
         return self.planner.plan(batch["achieved_goal"][0], target, self.event_radius)
-
-    def _checked_goal(self, goal: np.ndarray) -> np.ndarray:
-        try:
-            array = np.asarray(goal, dtype=np.float64)
-        except (TypeError, ValueError):
-            array = np.full(0, np.nan)
-        if array.shape != (self._spec.goal_dim,) or not np.isfinite(array).all():
-            raise ValueError(f"A goal must be a finite vector of shape ({self._spec.goal_dim},), not {goal!r}.")
-        return array
 
     def adapt(
         self: SelfSkillGraphAgent,
@@ -550,9 +490,9 @@ class SkillGraphAgent(Assembly):
         :return: the agent
         :raises ValueError: if the goal or the start is not a finite vector of goal space
         """
-        target = self._checked_goal(goal)
+        target = as_goal(goal, self._spec.goal_dim)
         assert self.env is not None, "Give the agent an environment (set_env) before adapt."
-        self._reset_options = {} if start is None else {"start": self._checked_goal(start)}
+        self._reset_options = {} if start is None else {"start": as_goal(start, self._spec.goal_dim)}
         self._last_obs, self._env_snapshot = None, None
         try:
             self.env.set_options(self._reset_options)
@@ -574,17 +514,6 @@ class _Pending(NamedTuple):
     held_actions: np.ndarray
     hold_left: np.ndarray
     rng_state: Any
-
-
-def _with_terminal(new_obs: dict[str, np.ndarray], dones: np.ndarray, infos: list[dict[str, Any]]) -> dict[str, np.ndarray]:
-    """Put the observations that ended episodes back in place of those that began the next ones."""
-    if not dones.any():
-        return new_obs
-    reached = {key: np.array(value) for key, value in new_obs.items()}
-    for i in np.flatnonzero(dones):
-        for key in reached:
-            reached[key][i] = infos[i]["terminal_observation"][key]
-    return reached
 
 
 def _refuse(

@@ -14,6 +14,7 @@ from sb3_skillgraph.options.option import Option
 from sb3_skillgraph.options.views import View
 from sb3_skillgraph.planner import GraphPlanner
 
+MANY_DECISIONS = 12  # options on the way to a goal after which the next best way is tried
 UNDECIDED, GLOBAL = -1, 0  # no option yet; the global option. Others follow, in the order of their making.
 
 
@@ -27,6 +28,7 @@ class ControllerState(NamedTuple):
     :param failures: approaches to the goal that have failed
     :param failed_last: index of the option that failed last on the way to the goal, ``-1`` for none
     :param failed_before: index of the one that failed before it, ``-1`` for none
+    :param decisions: options chosen so far on the way to the goal
     """
 
     option: np.ndarray
@@ -35,12 +37,13 @@ class ControllerState(NamedTuple):
     failures: np.ndarray
     failed_last: np.ndarray
     failed_before: np.ndarray
+    decisions: np.ndarray
 
     @classmethod
     def fresh(cls, n_envs: int) -> "ControllerState":
         """Return the state at the start of an episode."""
-        undecided, zeros = np.full(n_envs, UNDECIDED), np.zeros(n_envs, dtype=np.int64)
-        return cls(undecided, zeros, np.full(n_envs, -1), zeros.copy(), np.full(n_envs, -1), np.full(n_envs, -1))
+        none, zero = np.full(n_envs, -1), np.zeros(n_envs, dtype=np.int64)
+        return cls(np.full(n_envs, UNDECIDED), zero, none, zero.copy(), none.copy(), none.copy(), zero.copy())
 
     def copy(self) -> "ControllerState":
         """Return a copy that shares no memory."""
@@ -155,6 +158,8 @@ class Controller:
             success = ended == Fate.SUCCEEDED
             outcomes.append(OptionOutcome(i, index, aim, success, steps))
             state.option[i] = UNDECIDED
+            if not success:
+                state.aim[i] = -1  # so that no way is retraced further
             if not success and index == GLOBAL:
                 state.failures[i] += aim < 0
             elif not success and index != state.failed_last[i]:
@@ -188,7 +193,11 @@ class Controller:
         points = observation["achieved_goal"]
         for i in np.flatnonzero(state.option == UNDECIDED).tolist():
             failed = {int(state.failed_last[i]), int(state.failed_before[i])}
-            state.option[i], state.aim[i] = self.choose(points[i], requests[i], int(state.failures[i]), failed)
+            # Going round in circles is failing, too.
+            failures = int(state.failures[i] + state.decisions[i] // MANY_DECISIONS)
+            retracing = bool(state.aim[i] < -1)
+            state.option[i], state.aim[i] = self.choose(points[i], requests[i], failures, failed, retracing)
+            state.decisions[i] += 1
             state.steps[i] = 0
         aims = np.stack([self._aim(int(o), int(a), r) for o, a, r in zip(state.option, state.aim, requests, strict=True)])
         seen = self.view(observation["observation"], points, aims)
@@ -214,13 +223,16 @@ class Controller:
 
     # -- choosing an option -------------------------------------------------------------------------------------------
 
-    def choose(self, point: np.ndarray, request: Request, failures: int, failed: Collection[int]) -> tuple[int, int]:
+    def choose(
+        self, point: np.ndarray, request: Request, failures: int, failed: Collection[int], retracing: bool = False
+    ) -> tuple[int, int]:
         """Choose the option to run next.
 
         :param point: where the agent stands, shape ``(goal_dim,)``
         :param request: what it is to do
         :param failures: approaches to the goal that have failed
         :param failed: indices of options that have failed lately
+        :param retracing: whether the agent has just reached a waypoint of a way it retraces
         :return: index of the option; where the global option is to walk to (see :class:`ControllerState`)
         """
         if request.direct or not self.planning:
@@ -230,6 +242,8 @@ class Controller:
             return self._practise(point, request, failures, avoid)
         if request.event is not None:
             return self._towards(point, request.event, failures, avoid)
+        if retracing and self.planner.near_in_steps(point, request.goal):
+            return self._retrace(point, request.goal, -1, failures)  # do not turn back half-way
         return self._to_goal(point, request.goal, failures, avoid)
 
     def _practise(self, point: np.ndarray, request: Request, failures: int, avoid: Collection[str]) -> tuple[int, int]:

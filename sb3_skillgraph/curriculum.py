@@ -115,11 +115,12 @@ class Curriculum:
         """What each environment's agent is about."""
         return [mission for mission in self._missions if mission is not None]
 
-    def assign(self, env: int, point: np.ndarray) -> None:
+    def assign(self, env: int, point: np.ndarray, warm_up: bool = False) -> None:
         """Give an environment a mission if it has none, and note whether it stands where its chain begins.
 
         :param env: which environment
         :param point: where its agent stands, shape ``(goal_dim,)``
+        :param warm_up: whether there is nothing but random walks yet
         """
         mission = self._missions[env]
         if mission is None:
@@ -128,7 +129,7 @@ class Curriculum:
             if self._pinned_goal is not None:
                 self.pinned = self._pinned_event(self._pinned_goal).id
                 self._pinned_goal = None
-            mission = self._missions[env] = self._choose(point)
+            mission = self._missions[env] = self._random_walk() if warm_up else self._choose(point)
         if mission.chain is not None and not mission.left_graph:
             source = self.graph.events[self.chaining.chains[mission.chain].source]
             mission.left_graph = bool(source.contains(point[None])[0])
@@ -330,15 +331,18 @@ class Curriculum:
         chains = [c for c in self.chaining.open_chains() if not events[c.target].contains(point[None])[0]]
         return min(chains, key=cost, default=None)
 
+    def _random_walk(self) -> Mission:
+        return Mission(self.graph.events["e0"].center, explore_steps=self.strategy.exploration_steps, exploring=True)
+
     def _explore(self) -> Mission:
         """Return to where the agent has rarely been, and go on from there: at random, or towards a random point.
 
         Of some visited states, drawn as an RRT draws them (section 2.4: those nearest to uniform random points), it is
         the one with the fewest visits around it.
         """
-        steps = self.strategy.exploration_steps
         if self.visited.size < 2:
-            return Mission(self.graph.events["e0"].center, explore_steps=steps, exploring=True)
+            return self._random_walk()
+        steps = self.strategy.exploration_steps
         points, radius = self.visited.points, self.discovery.radius
         samples = self.rng.uniform(points.min(axis=0) - radius, points.max(axis=0) + radius, (N_EXPLORED, points.shape[1]))
         nearest = [points[self.visited.near(sample, 0.0)[0]] for sample in samples]

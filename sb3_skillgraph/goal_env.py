@@ -70,6 +70,62 @@ def rows(observation: dict[str, np.ndarray], key: str) -> np.ndarray:
     return array.reshape(len(array), -1)
 
 
+def as_batch(observation: Any, space: spaces.Space) -> tuple[dict[str, np.ndarray], bool]:
+    """Return one observation, or many, as float32 rows.
+
+    :param observation: Dict observation with or without a leading axis
+    :param space: the environment's observation space
+    :return: rows by entry, each of shape ``(n, dim)``, and whether there was a leading axis
+    :raises ValueError: if the observation does not fit the space
+    """
+    if not isinstance(observation, dict) or any(key not in observation for key in KEYS):
+        raise ValueError(f"A Dict observation with {', '.join(KEYS)} is needed, not {type(observation).__name__}.")
+    assert isinstance(space, spaces.Dict)
+    vectorized = np.ndim(observation["achieved_goal"]) > 1
+    batch = {}
+    for key in KEYS:
+        array = np.asarray(observation[key], dtype=np.float32)
+        shape = space[key].shape
+        if array.shape[int(vectorized) :] != shape:
+            raise ValueError(f"{key!r} has shape {array.shape}; expected {shape}, or the same with a leading axis.")
+        batch[key] = array.reshape(len(array) if vectorized else 1, -1)
+    return batch, vectorized
+
+
+def as_goal(goal: Any, goal_dim: int) -> np.ndarray:
+    """Return a point of goal space as an array.
+
+    :param goal: anything array-like
+    :param goal_dim: dimension of goal space
+    :return: shape ``(goal_dim,)``
+    :raises ValueError: if it is not a finite vector of that length
+    """
+    try:
+        array = np.asarray(goal, dtype=np.float64)
+    except (TypeError, ValueError):
+        array = np.full(0, np.nan)
+    if array.shape != (goal_dim,) or not np.isfinite(array).all():
+        raise ValueError(f"A goal must be a finite vector of shape ({goal_dim},), not {goal!r}.")
+    return array
+
+
+def with_terminal(new_obs: dict[str, np.ndarray], dones: np.ndarray, infos: list[dict[str, Any]]) -> dict[str, np.ndarray]:
+    """Put the observations that ended episodes back in place of those that began the next ones.
+
+    :param new_obs: what the VecEnv returned
+    :param dones: which episodes ended, shape ``(n_envs,)``
+    :param infos: the VecEnv's infos
+    :return: the observations that the last step led to
+    """
+    if not dones.any():
+        return new_obs
+    reached = {key: np.array(value) for key, value in new_obs.items()}
+    for i in np.flatnonzero(dones):
+        for key in reached:
+            reached[key][i] = infos[i]["terminal_observation"][key]
+    return reached
+
+
 def check_finite(observation: dict[str, np.ndarray], step: int) -> None:
     """Refuse observations that hold NaN or inf.
 

@@ -77,6 +77,7 @@ class Persistence(OffPolicyAlgorithm):
     _executed: list[int]
     _pending: Any
     _env_snapshot: dict[str, Any] | None = None
+    _loaded = False
 
     @property
     def options(self) -> OptionList:
@@ -235,7 +236,13 @@ class Persistence(OffPolicyAlgorithm):
         if isinstance(noise, VectorizedActionNoise) and noise.n_envs != agent.n_envs:
             agent.action_noise = noise.base_noise
         agent._setup_model()
-        agent._restore(tree, same_envs=agent.n_envs == tree["n_envs"] and not force_reset)
+        try:
+            agent._restore(tree, same_envs=agent.n_envs == tree["n_envs"] and not force_reset)
+        except (AttributeError, IndexError, KeyError, TypeError) as error:
+            raise ValueError(
+                f"The file was written by another version of sb3_skillgraph, or for another option_class ({error!r})."
+            ) from error
+        agent._loaded = True
         return agent
 
     def copy(self: SelfPersistence, env: GymEnv) -> SelfPersistence:
@@ -309,6 +316,9 @@ class Persistence(OffPolicyAlgorithm):
         :return: whether they were
         """
         snapshot, self._env_snapshot = self._env_snapshot, None
+        loaded, self._loaded = self._loaded, False
+        if loaded and self.verbose and snapshot is None:
+            print("The environments' states are not known (no get_state/set_state): learning resumes at a fresh episode.")
         if snapshot is None or self.env is None or not self.env.has_attr("set_state"):
             return False
         self.env.reset()

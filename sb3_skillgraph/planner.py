@@ -143,6 +143,10 @@ class GraphPlanner:
             return -1
         return self.visited.waypoint(point, goal, 0.5 * self.radius, self.reach // (6 if failures else 3))
 
+    def near_in_steps(self, point: np.ndarray, goal: np.ndarray) -> bool:
+        """Tell whether a trajectory went from a point to another in no more steps than three options take."""
+        return self.visited.steps_between(point, goal, 0.5 * self.radius) <= 3 * self.reach
+
     def entry(self, point: np.ndarray, target: str | None) -> SalientEvent | None:
         """Return the event by which to enter the graph from a point outside.
 

@@ -49,7 +49,13 @@ def profile(max_examples: int, *, shrink: bool = True) -> settings:
 
 
 def make_factory(
-    store: TransitionStore, *, view: View = relative_view, radius: float = 1.0, seed: int = 0, **replay_kwargs: Any
+    store: TransitionStore,
+    *,
+    view: View = relative_view,
+    radius: float = 1.0,
+    tolerance: float | None = None,
+    seed: int = 0,
+    **replay_kwargs: Any,
 ) -> OptionFactory:
     return OptionFactory(
         OptionDDPG,
@@ -58,6 +64,7 @@ def make_factory(
         ScaledView(view, radius),
         spaces.Box(-1.0, 1.0, (2,), np.float32),
         radius,
+        radius if tolerance is None else tolerance,
         np.random.default_rng(seed),
         {"hindsight": 0.8, "shared": 0.5, "horizon": 50} | replay_kwargs,
         th.device("cpu"),
@@ -131,7 +138,7 @@ class World:
         )
         self.global_option = make_option("global", None, None, seed=0)
         self.controller = Controller(
-            self.global_option, self.chaining, self.planner, ScaledView(relative_view, 1.0), 1.0, timeout, False
+            self.global_option, self.chaining, self.planner, ScaledView(relative_view, 1.0), 1.0, 0.5, timeout, False
         )
         self.clock = 0
 
@@ -173,9 +180,14 @@ class World:
 
     def walk(self, start: Sequence[float], end: Sequence[float], n_steps: int) -> None:
         """Record one trajectory straight from one point to another, ``n_steps`` long."""
-        for t, share in enumerate(np.linspace(0.0, 1.0, n_steps + 1)):
-            point = (1.0 - share) * np.array(start) + share * np.array(end)
-            self.visited.record(0, self.clock, point.astype(np.float32), done=t == n_steps)
+        self.tour([start, end], n_steps)
+
+    def tour(self, corners: Sequence[Sequence[float]], n_steps: int) -> None:
+        """Record one trajectory around some corners, ``n_steps`` from each to the next."""
+        n_total = n_steps * (len(corners) - 1)
+        for t in range(n_total + 1):
+            point = [np.interp(t / n_steps, range(len(corners)), xs) for xs in zip(*corners, strict=True)]
+            self.visited.record(0, self.clock, np.array(point, dtype=np.float32), done=t == n_total)
             self.clock += 1
 
     def line(self) -> None:

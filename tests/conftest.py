@@ -25,11 +25,13 @@ from sb3_skillgraph.saving import load_tree
 th.set_num_threads(1)
 
 TOY, POINT = "SkillGraph/ToyMaze-v0", "SkillGraph/PointMazeUMaze-v0"
-#: Small networks and batches: a thousand steps take a second.
-SMALL: dict[str, Any] = dict(policy_kwargs=dict(net_arch=[16, 16]), batch_size=32, learning_starts=200, seed=0)
-#: Options mature at their first success and events lie close together, so that a few hundred steps give a graph worth
-#: the name, with chains in both directions.
-EAGER: dict[str, Any] = dict(SMALL, gestation_period=1, event_reach=10)
+#: Small networks and batches, an update at every step: a thousand steps take a second.
+SMALL: dict[str, Any] = dict(policy_kwargs=dict(net_arch=[16, 16]), batch_size=32, learning_starts=200, train_freq=1, seed=0)
+#: Options mature at their first success, one run of their own completes a chain, runs and explorations are short, and
+#: events lie close together, so that a few hundred steps give a graph worth the name, with chains in both directions.
+EAGER: dict[str, Any] = dict(
+    SMALL, gestation_period=1, practice_runs=1, option_timeout=50, exploration_steps=20, event_reach=10
+)
 
 
 def new_agent(env: gym.Env | VecEnv | str = TOY, **kwargs: Any) -> SkillGraphAgent:
@@ -194,7 +196,10 @@ def trained_files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]
     folder = tmp_path_factory.mktemp("trained")
     agent = new_agent().learn(1500, log_interval=None)
     assert len(agent.options) > 4
+    assert len(agent.graph.options) > 4
     assert agent.graph.nx.number_of_edges() > 4
+    complete = {chain.id for chain in agent.chaining.chains.values() if chain.complete}
+    assert any(">".join(reversed(id.split(">"))) in complete for id in complete)
     agent.save(folder / "agent.zip")
     agent.save_replay_buffer(folder / "replay.zip")
     return folder / "agent.zip", folder / "replay.zip"

@@ -7,7 +7,7 @@ import pytest
 from builders import PAPER_GRAPH, World
 
 from sb3_skillgraph.chaining import DeepSkillChaining, SkillChain
-from sb3_skillgraph.options.option import Option
+from sb3_skillgraph.options.option import RECORD_LENGTH, Option
 
 
 class Line(World):
@@ -220,6 +220,66 @@ def test_a_complete_chain_whose_edge_breaks_is_open_again(line: Line) -> None:
     line.fail(root, 0.0, 20)
     assert not line.graph.nx.has_edge("e0", "o1")
     assert not line.chain.complete
+
+
+@pytest.mark.parametrize("practice_runs", [1, 2, 5])
+def test_a_chain_stays_open_until_so_many_runs_of_its_own_have_succeeded(line: Line, practice_runs: int) -> None:
+    line.chaining.practice_runs = practice_runs
+    line.chaining.gestation_period = 1
+    root = line.option(0)
+    line.succeed(root, 0.0, 9, own=False)
+    assert root.mature
+    assert line.planner.path_to(np.zeros(2), "e1") is not None  # the graph has its edge meanwhile
+    for _ in range(practice_runs):
+        assert line.chain.open
+        line.fail(root, 5.0)
+        assert line.chain.open
+        line.succeed(root, 0.0)
+    assert line.chain.complete
+    assert line.chaining.open_chains() == []
+
+
+def test_practice_that_is_long_ago_does_not_count(line: Line) -> None:
+    """Successes among the recent runs, not ever."""
+    line.chaining.max_failures, line.chaining.practice_runs = None, 2
+    root = line.option(0)
+    line.succeed(root, 0.0, 3)
+    assert line.chain.complete
+    line.fail(root, 5.0, RECORD_LENGTH - 1)
+    assert line.graph.nx.has_edge("e0", "o1")
+    assert line.chain.open
+
+
+def test_an_option_that_cannot_start_at_the_source_completes_nothing(line: Line) -> None:
+    line.chaining.practice_runs = 2
+    line.succeed(line.option(0), 6.0, 12)
+    assert line.chain.open
+    line.succeed(line.option(1), 0.0, 3, own=False)  # the child matures by what others did
+    assert line.graph.nx.has_edge("e0", "o2")
+    line.succeed(line.option(0), 6.0, 3)
+    assert line.chain.open  # the practice of the one is none of the other
+    line.succeed(line.option(1), 0.0, 2)
+    assert line.chain.complete
+
+
+def test_a_success_in_a_dropped_chain_counts_but_does_not_open_it(line: Line) -> None:
+    root = line.option(0)
+    line.fail(root, 5.0, 4)
+    assert line.chain.dropped
+    line.succeed(root, 0.0, 2)
+    assert not line.chain.open
+    line.succeed(root, 0.0)
+    assert line.chain.complete
+    assert line.chain.dropped
+    assert line.planner.path_to(np.zeros(2), "e1") is not None
+
+
+def test_a_run_from_the_source_puts_all_of_it_into_the_set(line: Line) -> None:
+    root = line.option(0)
+    line.succeed(root, 0.9, 3)
+    assert root.initiation.optimistic(line.source.outline()).all()
+    assert line.chain.complete
+    assert line.admissible(-0.9) == "o1"
 
 
 def test_a_chain_is_practised_until_its_own_runs_have_succeeded(line: Line) -> None:

@@ -1,5 +1,7 @@
 """Options chosen and run on hand-built graphs, one step at a time (sections 3.2.4, 3.2.5)."""
 
+from collections.abc import Collection
+
 import numpy as np
 import pytest
 from builders import World
@@ -29,8 +31,27 @@ def line() -> World:
     return world
 
 
-def choose(world: World, x: float, request: Request, failures: int = 0, avoid: int = -1) -> tuple[int, int]:
-    return world.controller.choose(at(x)[0], request, failures, avoid)
+def choose(world: World, x: float, request: Request, failures: int = 0, failed: Collection[int] = ()) -> tuple[int, int]:
+    return world.controller.choose(at(x)[0], request, failures, failed)
+
+
+def waypoint(world: World, aim: int) -> np.ndarray:
+    """The visited point that an aim of -2 and less stands for."""
+    assert -2 - world.visited.size < aim <= -2
+    return world.visited.points[-2 - aim].astype(np.float64)
+
+
+def retrace(world: World, start: np.ndarray, request: Request, failures: int = 0) -> tuple[np.ndarray, int]:
+    """The waypoints of a walk by the global option that reaches each of them, and where it aims at last."""
+    ways, point = [], start
+    for _ in range(100):
+        index, aim = world.controller.choose(point, request, failures, ())
+        assert index == GLOBAL
+        if aim > -2:
+            return np.array(ways).reshape(-1, 2), aim
+        point = waypoint(world, aim)
+        ways.append(point)
+    raise AssertionError(f"walks for ever: {ways[-4:]}")
 
 
 def state(n_envs: int = 1, **fields: list[int]) -> ControllerState:
@@ -41,11 +62,11 @@ def test_a_fresh_state_is_undecided() -> None:
     fresh = ControllerState.fresh(3)
     assert all(array.shape == (3,) for array in fresh)
     assert fresh.option.tolist() == [UNDECIDED] * 3
-    assert fresh.failures.tolist() == fresh.steps.tolist() == [0] * 3
-    assert fresh.avoid.tolist() == fresh.aim.tolist() == [-1] * 3
+    assert fresh.failures.tolist() == fresh.steps.tolist() == fresh.decisions.tolist() == [0] * 3
+    assert fresh.failed_last.tolist() == fresh.failed_before.tolist() == fresh.aim.tolist() == [-1] * 3
     copied = fresh.copy()
     assert not any(np.shares_memory(a, b) for a, b in zip(copied, fresh, strict=True))
-    assert len({array.__array_interface__["data"][0] for array in fresh}) == 5
+    assert len({array.__array_interface__["data"][0] for array in fresh}) == len(fresh) == 7
 
 
 # -- choosing ---------------------------------------------------------------------------------------------------------
@@ -76,12 +97,24 @@ def test_no_option_is_chosen_from_outside_its_initiation_set(line: World) -> Non
 
 
 def test_outside_the_graph_the_agent_walks_to_where_it_can_be_entered(line: World) -> None:
-    option, aim = choose(line, 5.0, to_event(line, "e2"))
-    assert option == GLOBAL
-    assert aim in (0, 1)
+    xs = [5.0]
+    while (option := choose(line, xs[-1], to_event(line, "e2")))[0] == GLOBAL:
+        assert option[1] in (0, 1) or option[1] <= -2
+        to = waypoint(line, option[1]) if option[1] <= -2 else line.controller.event(option[1]).center
+        assert to[1] == 0.0
+        xs.append(to[0])
+    assert option in ((O1, -1), (O2, -1))
+    assert len(xs) > 1
+    assert (np.diff(xs) > 0).all() or (np.diff(xs) < 0).all()  # nearer with every waypoint
     for id in ("o1", "o2", "o3", "o4"):
         line.graph.remove_option(line.graph.options[id])
-    assert choose(line, 5.0, to_event(line, "e2")) == (GLOBAL, 2)  # straight to the event, where nothing leads on
+    points, aim = retrace(line, at(5.0)[0], to_event(line, "e2"))
+    assert aim == 2  # to the event itself, where nothing leads on
+    assert len(points) >= 2
+    assert (np.diff(points[:, 0]) > 0).all()
+    blind = World()
+    blind.add_event(20.0, 0.0)
+    assert choose(blind, 5.0, to_event(blind, "e0")) == (GLOBAL, 0)  # straight: nobody has been there
 
 
 def test_direct_requests_and_an_agent_that_does_not_plan_walk_straight(line: World) -> None:
@@ -96,19 +129,39 @@ def test_a_detour_around_the_option_that_has_just_failed(line: World) -> None:
     detour = line.add_option(line.graph.events["e1"], (0.0, 0.0), failures=8)
     for request in (to_event(line, "e2"), Request(at(20.0)[0])):
         assert choose(line, 0.0, request) == (O1, -1)
-        assert choose(line, 0.0, request, avoid=O1) == (line.controller.index(detour), -1)
-        assert choose(line, 0.0, request, avoid=O2) == (O1, -1)
+        assert choose(line, 0.0, request, failed=[O1]) == (line.controller.index(detour), -1)
+        assert choose(line, 0.0, request, failed=[GLOBAL, -1]) == (O1, -1)
+    assert choose(line, 10.0, to_event(line, "e2"), failed=[O1]) == (O2, -1)
+    assert choose(line, 0.0, to_event(line, "e2"), failed=[O1, line.controller.index(detour)]) == (O1, -1)  # no other way
+
+
+def test_a_detour_around_an_option_that_failed_further_on(line: World) -> None:
+    """Not only the option to begin with: none that has failed lately is in the plan if there is another way."""
+    straight = line.add_option(line.graph.events["e2"], (0.0, 0.0), failures=11)  # dearer than o1 and o2 together
+    for request in (to_event(line, "e2"), Request(at(20.0)[0])):
+        assert choose(line, 0.0, request) == (O1, -1)
+        assert choose(line, 0.0, request, failed=[O1]) == (line.controller.index(straight), -1)
+        assert choose(line, 0.0, request, failed=[O2]) == (line.controller.index(straight), -1)
+        assert choose(line, 0.0, request, failed=[O3, O4]) == (O1, -1)
+
+
+def test_a_goal_no_other_option_leads_to_is_walked_to_along_the_known_way(line: World) -> None:
+    option, aim = choose(line, 0.0, Request(at(20.0)[0]), failed=[O2])
+    assert option == GLOBAL
+    assert 0.0 < waypoint(line, aim)[0] < 20.0
 
 
 def test_after_a_failed_approach_the_next_leg(line: World) -> None:
     line.add_option(line.graph.events["e2"], (0.0, 0.0), failures=7)  # straight to e2, but dear
     goal = Request(at(14.0)[0])
     legs = line.planner.legs(at(0.0)[0], goal.goal)
-    starts = [leg.path.vertices[0] for leg in legs if leg.path is not None]
-    assert len(starts) == len(legs) >= 2
+    assert len({leg.path.vertices[0] for leg in legs if leg.path is not None}) >= 2
+    assert any(leg.path is None for leg in legs)  # the way walked before, from end to end
     for failures in range(len(legs) + 2):  # the last leg is kept to
-        expected = starts[min(failures, len(legs) - 1)]
-        assert choose(line, 0.0, goal, failures) == (int(expected[1:]), -1)
+        path = legs[min(failures, len(legs) - 1)].path
+        option, aim = choose(line, 0.0, goal, failures)
+        assert option == (GLOBAL if path is None else int(path.vertices[0][1:]))
+        assert aim == -1 or path is None
 
 
 def test_a_failed_approach_leads_to_another_event() -> None:
@@ -120,7 +173,7 @@ def test_a_failed_approach_leads_to_another_event() -> None:
     world.walk((10, 0), (10, 10), 20)
     world.walk((0, 10), (10, 10), 35)
     goal = Request(np.array([10.0, 10.0]))
-    chosen = [world.controller.choose(start.center, goal, failures, -1)[0] for failures in range(3)]
+    chosen = [world.controller.choose(start.center, goal, failures, ())[0] for failures in range(3)]
     assert chosen == [world.controller.index(first), world.controller.index(second), world.controller.index(second)]
 
 
@@ -131,6 +184,90 @@ def test_practice_plans_to_the_chains_source_and_then_follows_the_chain(line: Wo
     assert choose(line, 0.0, request) == (O1, -1)
     assert choose(line, 10.0, request) == (line.controller.index(root), -1)
     assert choose(line, 0.0, request._replace(left_graph=True)) == (line.controller.index(root), -1)
+
+
+# -- known ways -------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def corner() -> World:
+    """A corridor around a corner, walked once: right, then up."""
+    world = World(reach=30)
+    world.tour([(0, 0), (10, 0), (10, 10)], 20)
+    return world
+
+
+@pytest.mark.parametrize("failures", [0, 1, 5])
+@pytest.mark.parametrize("start", [(0.0, 0.0), (0.2, -0.3), (4.1, 0.2), (0.0, -3.0)])
+def test_the_global_option_retraces_a_known_way_around_a_corner(
+    corner: World, start: tuple[float, float], failures: int
+) -> None:
+    goal = np.array([10.0, 9.0])
+    points, aim = retrace(corner, np.array(start), Request(goal), failures)
+    assert aim == -1  # at last the goal itself
+    on_first, on_second = points[:, 1] == 0.0, points[:, 0] == 10.0
+    assert (on_first | on_second).all()  # never across the corner
+    assert on_first.any()
+    assert on_second.any()
+    passed = points.sum(axis=1)  # what lies behind, in goal units
+    stretches = np.diff([max(start[0], 0.0), *passed, 19.0])
+    assert (stretches > 0).all()
+    assert stretches.max() <= (corner.planner.reach // (6 if failures else 3)) * 0.5 + 1.0
+
+
+def test_stretches_are_shorter_after_a_failure(corner: World) -> None:
+    n_waypoints = [len(retrace(corner, np.zeros(2), Request(np.array([10.0, 9.0])), n)[0]) for n in (0, 1)]
+    assert n_waypoints[1] > n_waypoints[0] > 2
+
+
+def test_a_way_back_nobody_has_gone_is_not_made_up(corner: World) -> None:
+    assert choose(corner, 30.0, Request(np.array([-9.0, 0.0]))) == (GLOBAL, -1)
+    back = corner.controller.choose(np.array([10.0, 10.0]), Request(np.zeros(2)), 0, ())
+    assert back == (GLOBAL, -1)
+
+
+def test_by_euclidean_nearness_the_global_option_walks_straight() -> None:
+    """The paper's agent knows no ways but those of the graph."""
+    world = World(nearest="euclidean")
+    world.tour([(0, 0), (10, 0), (10, 10)], 20)
+    assert choose(world, 0.0, Request(np.array([10.0, 9.0]))) == (GLOBAL, -1)
+
+
+def test_a_retraced_way_is_walked_waypoint_by_waypoint(corner: World) -> None:
+    controller, request = corner.controller, [Request(np.array([10.0, 9.0]))]
+    running, point, ends = ControllerState.fresh(1), np.zeros((1, 2)), []
+    for _ in range(60):
+        _, aims, running = controller.act(observe(point), running, request)
+        assert running.option.tolist() == [GLOBAL]
+        way = aims - point
+        point = point + way * min(1.0, 2.0 / max(float(np.linalg.norm(way)), 1e-9))  # two units a step, straight
+        running, outcomes = controller.advance(running, point, request)
+        ends += [(outcome.success, outcome.aim) for outcome in outcomes]
+        if ends and ends[-1][1] == -1:
+            break
+    assert all(success for success, _ in ends)
+    assert ends[-1][1] == -1
+    assert len({aim for _, aim in ends}) == len(ends) > 2
+    assert running.failures.tolist() == [0]
+
+
+def test_a_waypoint_stays_where_it_is_when_old_trajectories_are_forgotten() -> None:
+    world = World(reach=30)
+    world.visited.capacity = 100
+    world.walk((50, 0), (80, 0), 60)
+    world.tour([(0, 0), (9, 0), (9, 8)], 17)
+    request = [Request(np.array([9.0, 7.5]))]
+    _, aims, running = world.controller.act(observe(at(0.0)), ControllerState.fresh(1), request)
+    assert running.aim[0] <= -2
+    size = world.visited.size
+    world.walk((50, 5), (60, 5), 20)
+    assert world.visited.size < size + 20  # some have been forgotten, but not where the agent walks
+    running, outcomes = world.controller.advance(running, at(0.0), request)
+    assert outcomes == []
+    _, again, running = world.controller.act(observe(at(0.0)), running, request)
+    np.testing.assert_array_equal(again, aims)
+    _, outcomes = world.controller.advance(running, aims, request)
+    assert [outcome.success for outcome in outcomes] == [True]
 
 
 # -- closed loop ------------------------------------------------------------------------------------------------------
@@ -186,14 +323,51 @@ def test_the_global_option_ends_where_it_walks_to(line: World) -> None:
         assert all(outcome.success and outcome.aim == aim for outcome in outcomes)
 
 
-def test_what_failed_is_remembered_until_something_else_ends(line: World) -> None:
+def test_a_waypoint_is_reached_within_the_tolerance(line: World) -> None:
+    request = [Request(at(14.0)[0])]
+    k = int(np.linalg.norm(line.visited.points - at(7.0), axis=1).argmin())
+    assert line.controller.tolerance < line.controller.radius
+    for x, ended in ((7.4, True), (7.6, False), (6.6, True), (6.4, False)):
+        _, outcomes = line.controller.advance(state(option=[GLOBAL], aim=[-2 - k], steps=[1]), at(x), request)
+        assert outcomes == ([(0, GLOBAL, -2 - k, True, 1)] if ended else [])
+
+
+def test_the_last_two_options_that_failed_are_remembered(line: World) -> None:
     request = [to_event(line, "e2")]
-    running, _ = line.controller.advance(state(option=[O1], steps=[10]), at(5.0), request)
-    assert (running.avoid.tolist(), running.failures.tolist()) == ([O1], [0])
-    succeeded, _ = line.controller.advance(running._replace(option=np.array([O2])), at(20.0), request)
-    assert succeeded.avoid.tolist() == [-1]
-    walked, _ = line.controller.advance(running._replace(option=np.array([GLOBAL]), steps=np.array([5])), at(5.0), request)
-    assert (walked.avoid.tolist(), walked.failures.tolist()) == ([-1], [1])
+
+    def end(running: ControllerState, option: int, x: float, steps: int = 10) -> ControllerState:
+        running = running._replace(option=np.array([option]), steps=np.array([steps]))
+        after, outcomes = line.controller.advance(running, at(x), request)
+        assert len(outcomes) == 1
+        return after
+
+    def failed(running: ControllerState) -> tuple[list[int], list[int]]:
+        return running.failed_last.tolist(), running.failed_before.tolist()
+
+    first = end(ControllerState.fresh(1), O1, 5.0)
+    assert failed(first) == ([O1], [-1])
+    assert first.failures.tolist() == [0]  # an option that fails is no failed approach to the goal
+    assert failed(end(first, O1, 5.0)) == ([O1], [-1])  # the same once more
+    assert failed(end(first, O2, 20.0)) == ([O1], [-1])  # a success
+    walked = end(first, GLOBAL, 5.0, steps=5)
+    assert failed(walked) == ([O1], [-1])
+    assert walked.failures.tolist() == [1]
+    second = end(first, O2, 5.0)
+    assert failed(second) == ([O2], [O1])
+    assert failed(end(second, O1, 5.0)) == ([O1], [O2])
+    assert failed(end(second, O3, 5.0)) == ([O3], [O2])
+
+
+def test_what_failed_is_not_chosen_at_once_again(line: World) -> None:
+    """Closed loop: what ``advance`` remembers, ``act`` avoids."""
+    detour = line.add_option(line.graph.events["e1"], (0.0, 0.0), failures=8)
+    request = [to_event(line, "e2")]
+    running = state(option=[O1], steps=[10])
+    for expected in (line.controller.index(detour), O1, O1):  # after both have failed, there is no other way
+        running, _ = line.controller.advance(running, at(0.0), request)
+        _, _, running = line.controller.act(observe(at(0.0)), running, request)
+        assert running.option.tolist() == [expected]
+        running = running._replace(steps=np.array([10]))
 
 
 def test_a_walk_to_an_event_is_no_approach_to_the_goal(line: World) -> None:
@@ -202,6 +376,9 @@ def test_a_walk_to_an_event_is_no_approach_to_the_goal(line: World) -> None:
     running, outcomes = line.controller.advance(walk, at(5.0), [Request(at(14.0)[0])])
     assert [outcome.success for outcome in outcomes] == [False]
     assert running.failures.tolist() == [0]
+    for aim in (-1, -2, -9):  # the goal itself, or a waypoint of the way there
+        running, _ = line.controller.advance(walk._replace(aim=np.array([aim])), at(50.0), [Request(at(14.0)[0])])
+        assert running.failures.tolist() == [1]
 
 
 def test_inputs_are_left_as_they_were(line: World) -> None:
@@ -249,7 +426,7 @@ def test_gestating_options_act_with_the_global_policy_only_when_warm_started(lin
     root = line.chaining.options[chain.options[0]]
     request = [Request(at(20.0)[0], event="e2", chain=chain.id)]
     cold = line.controller
-    warm = Controller(line.global_option, line.chaining, line.planner, cold.view, 1.0, 10, warm_start=True)
+    warm = Controller(line.global_option, line.chaining, line.planner, cold.view, 1.0, 0.5, 10, warm_start=True)
     observation = observe(at(0.0))
     seen = cold.view(observation["observation"], observation["achieved_goal"], at(20.0))
     for controller, mature, actor in (

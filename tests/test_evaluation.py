@@ -104,7 +104,7 @@ def test_environment_arguments_reach_it() -> None:
 
 
 def test_bad_arguments() -> None:
-    with pytest.raises(ValueError, match="geometry"):
+    with pytest.raises(ValueError, match="needs a SkillGraph/\\* environment, not 'Pendulum-v1'"):
         evaluate_pairs(RandomWalk(), "Pendulum-v1")
     with pytest.raises(ValueError, match="too small"):
         evaluate_pairs(RandomWalk(), TOY, n_pairs=2, env_kwargs=dict(maze_map=[[1, 1, 1], [1, "r", 1], [1, 1, 1]]))

@@ -24,6 +24,15 @@ def leads_to_e1(**kwargs: object) -> Option:
     return make_option("o1", "e1", E1, **({"start": ((0.0, 0.0), 3.0)} | kwargs))  # type: ignore[arg-type]
 
 
+def known_beside_e0() -> Option:
+    """An option to e1 known to start beside e0 only."""
+    option = leads_to_e1()
+    for _ in range(3):
+        option.succeeded(np.linspace([2.0, 0.0], [9.0, 0.0], 12), np.array([10.0, 0.0]))
+    option.initiation.refit(force=True)
+    return option
+
+
 def ran(graph: SkillGraph, option: Option, success: bool, end: tuple[float, float] = (10.0, 0.0)) -> None:
     if success:
         option.succeeded(np.zeros((3, 2)), np.array(end))
@@ -146,21 +155,72 @@ def test_strict_containment_holds_between_an_option_and_the_one_it_chains_to() -
 
 
 def test_evidence_makes_an_edge_where_containment_does_not() -> None:
+    """Runs from one side of an event that succeed put the whole event into the set: it is contained from then on."""
+    for evidence_edges in (True, False):
+        graph = two_events(evidence_edges=evidence_edges)
+        for x in (-0.9, 0.9):
+            graph.triggered(E0, np.array([x, 0.0]))
+        option = known_beside_e0()
+        graph.add_option(option)
+        assert not graph.nx.has_edge("e0", "o1")
+        graph.ran_from(E0, option, True)
+        graph.refresh(option, refitted=True)
+        assert graph.nx.has_edge("e0", "o1") == evidence_edges
+        assert option.initiation.optimistic(E0.outline()).all() == evidence_edges
+    assert not option.initiation.optimistic(np.array([[-8.0, 0.0]]))[0]  # and no more than that
+
+
+def test_an_edge_from_evidence_weighs_nothing_and_its_rate_is_the_share_inside() -> None:
     graph = two_events()
-    option = leads_to_e1(start=((5.0, 0.0), 1.0))
+    option = known_beside_e0()
     graph.add_option(option)
-    assert not graph.nx.has_edge("e0", "o1")
     graph.ran_from(E0, option, True)
     graph.refresh(option, refitted=True)
     assert graph.nx.edges["e0", "o1"]["weight"] == 0.0
-    assert graph.nx.edges["e0", "o1"]["success_rate"] == pytest.approx(2 / 3)
+    assert graph.nx.edges["e0", "o1"]["success_rate"] == 1.0
+
+
+def test_evidence_holds_at_once_for_every_question() -> None:
+    """Edges, plans and the batched sets follow the option's own set as soon as the run has been told of."""
+    graph = two_events()
+    option = known_beside_e0()
+    graph.add_option(option)
+    side = np.array([-0.6, 0.0])
+    assert graph.startable(side) == []
+    graph.ran_from(E0, option, True)
+    graph.refresh(option, refitted=False)
+    assert option.initiation.optimistic(side[None])[0]
+    assert graph.startable(side) == ["o1"]
+    assert graph.shortest_path(["e0"], "e1") is not None
+    for _ in range(3):
+        option.failed(side)
+        graph.ran_from(E0, option, False)
+        graph.refresh(option, refitted=False)
+    assert not option.initiation.optimistic(side[None])[0]
+    assert graph.startable(side) == []
+    assert graph.shortest_path(["e0"], "e1") is None
+
+
+def test_evidence_counts_while_runs_mostly_succeed() -> None:
+    graph = two_events()
+    option = known_beside_e0()
+    graph.add_option(option)
+    for success, held in ((False, False), (True, True), (False, False), (True, True), (True, True), (False, True)):
+        graph.ran_from(E0, option, success)
+        assert (list(option.initiation.regions) == ["e0"]) == held
+    assert list(graph.evidence["e0", "o1"]) == [False, True, False, True, True, False]
+    for _ in range(20):  # only recent runs count
+        graph.ran_from(E0, option, False)
+    for _ in range(5):
+        graph.ran_from(E0, option, True)
+    assert list(option.initiation.regions) == ["e0"]
 
 
 @pytest.mark.parametrize("refitted", [True, False])
 def test_evidence_that_turns_takes_its_edge_away(refitted: bool) -> None:
     """At once, not only when the option's set is next fitted."""
     graph = two_events()
-    option = leads_to_e1(start=((5.0, 0.0), 1.0))
+    option = known_beside_e0()
     graph.ran_from(E0, option, True)
     graph.add_option(option)
     assert graph.nx.has_edge("e0", "o1")
@@ -172,9 +232,10 @@ def test_evidence_that_turns_takes_its_edge_away(refitted: bool) -> None:
 
 def test_the_paper_knows_no_evidence() -> None:
     graph = two_events(**PAPER_GRAPH)
-    option = leads_to_e1(start=((5.0, 0.0), 1.0))
+    option = known_beside_e0()
     for _ in range(5):
         graph.ran_from(E0, option, True)
+    assert option.initiation.regions == {}
     graph.add_option(option)
     assert not graph.nx.has_edge("e0", "o1")
 
@@ -199,6 +260,44 @@ def test_the_cheapest_path_and_its_success_probability() -> None:
     assert graph.shortest_path([], "e2") is None
     assert graph.shortest_path(["e0"], "e9") is None
     assert graph.shortest_path(["e0"], "e0") == (("e0",), 0.0, 1.0)
+
+
+def test_paths_from_several_vertices() -> None:
+    graph = two_events(**PAPER_GRAPH)
+    e2 = event(2, 20.0, 0.0)
+    graph.add_event(e2)
+    graph.add_option(make_option("o1", "e1", E1, start=((0.0, 0.0), 2.0), effects=[(10, 0)], record=[True, True]))
+    graph.add_option(make_option("o2", "e2", e2, start=((10.0, 0.0), 2.0), record=[True, False]))
+    graph.add_option(make_option("o3", "e2", e2, start=((0.0, 0.0), 2.0), record=[True] + [False] * 3))
+    costs, paths = graph.paths_from(["o1", "o3"])
+    assert costs == {"o1": 0.0, "o3": 0.0, "e1": 1.0, "o2": 1.0, "e2": 3.0}
+    assert paths["e2"] == ["o1", "o2", "e2"]
+    costs, paths = graph.paths_from(["o1", "o3"], avoid=["o2", "o9"])
+    assert costs == {"o1": 0.0, "o3": 0.0, "e1": 1.0, "e2": 4.0}
+    assert paths["e2"] == ["o3", "e2"]
+    assert graph.paths_from(["o1"], avoid=["o1"]) == ({}, {})
+    assert graph.paths_from([]) == ({}, {})
+    assert graph.nx.has_edge("o1", "o2")  # asking has changed nothing
+    assert graph.shortest_path(["o1"], "e2") is not None
+
+
+@pytest.mark.parametrize("avoid", [[], ["o9"]])
+def test_among_equally_cheap_ways_the_first_source_wins(avoid: list[str]) -> None:
+    """The answer depends on the order of the sources and of the graph, on nothing else (not on how strings hash)."""
+    graph = two_events()
+    for k in range(1, 10):
+        graph.add_option(make_option(f"o{k}", "e1", E1, start=((0.0, 0.0), 2.0), effects=[(10, 0)], record=[True]))
+    for sources in (["o3", "o1", "o2"], ["o2", "o3", "o2", "o1"], ["o1", "o3"]):
+        assert graph.paths_from(sources, avoid)[1]["e1"] == [sources[0], "e1"]
+        assert list(graph.paths_from(sources, avoid)[0])[: len(set(sources))] == list(dict.fromkeys(sources))
+
+
+def test_useful_are_the_startable_options_that_do_not_end_at_once() -> None:
+    graph = two_events()
+    graph.add_option(leads_to_e1(start=((5.0, 0.0), 9.0)))
+    graph.add_option(make_option("o2", "e0", E0, start=((5.0, 0.0), 9.0)))
+    assert [graph.useful(np.array([x, 0.0])) for x in (0.0, 5.0, 10.0, 50.0)] == [["o1"], ["o1", "o2"], ["o2"], []]
+    assert graph.startable(np.zeros(2)) == ["o1", "o2"]
 
 
 def test_startable_are_the_options_whose_set_contains_the_point() -> None:

@@ -2,6 +2,7 @@
 
 import copy
 import math
+from collections.abc import Iterable
 from typing import Any
 
 import networkx as nx
@@ -57,11 +58,7 @@ def event_option_rate(graph: SkillGraph, id: str, option: Option) -> float:
     share = share_inside(option, list(graph.triggers[id]))
     if option.target == id:
         return 0.0
-    if share >= graph.containment:
-        return share
-    outcomes = graph.evidence.get((id, option.id), ())
-    smoothed = (sum(outcomes) + 1) / (len(outcomes) + 2)
-    return smoothed if graph.evidence_edges and outcomes and smoothed >= 0.5 else 0.0
+    return share if share >= graph.containment else 0.0
 
 
 def allowed_rate(graph: SkillGraph, source: str, target: str) -> float:
@@ -86,6 +83,23 @@ def check_edges(graph: SkillGraph) -> None:
         assert edge["weight"] == (0.0 if source in graph.events else 1.0 / edge["success_rate"])
 
 
+def check_regions(graph: SkillGraph, options: Iterable[Option]) -> None:
+    """An option's set counts a whole event while runs begun there mostly succeed; the bank answers as the sets do."""
+    for option in options:
+        proven = {
+            event
+            for (event, id), outcomes in graph.evidence.items()
+            if id == option.id and (sum(outcomes) + 1) / (len(outcomes) + 2) >= 0.5
+        }
+        assert set(option.initiation.regions) == (proven if graph.evidence_edges else set())
+        for id, points in option.initiation.regions.items():
+            np.testing.assert_array_equal(points, graph.events[id].outline())
+    points = np.stack([np.linspace(-3.0, 13.0, 9), np.zeros(9)], axis=1)
+    members, ids = graph.bank()
+    for column, id in zip(members.contains(points).T, ids, strict=True):
+        np.testing.assert_array_equal(column, graph.options[id].initiation.optimistic(points), err_msg=id)
+
+
 def check_paths(graph: SkillGraph) -> None:
     """Every path returned is one of the graph, the cheapest, and its numbers are those of its edges."""
     backwards = graph.nx.reverse(copy=True)
@@ -101,6 +115,15 @@ def check_paths(graph: SkillGraph) -> None:
             assert math.isclose(path.cost, sum(edge["weight"] for edge in edges))
             assert math.isclose(path.cost, costs[source])
             assert math.isclose(path.success_probability, math.prod(edge["success_rate"] for edge in edges))
+    for sources in (list(graph.nx)[:1], list(graph.options)[:3], []):
+        costs, paths = graph.paths_from(sources)
+        best = {target: graph.shortest_path(sources, target) for target in graph.nx}
+        assert set(costs) == set(paths) == {target for target, path in best.items() if path is not None}
+        for target, path in best.items():
+            if path is not None:
+                assert math.isclose(costs[target], path.cost)
+                assert paths[target][0] in sources
+                assert paths[target][-1] == target
 
 
 def check_starts(world: World) -> None:
@@ -112,11 +135,29 @@ def check_starts(world: World) -> None:
         assert graph.startable(point) == startable
         for target in graph.events:
             path = world.planner.path_to(point, target)
-            assert (path is not None) == any(nx.has_path(graph.nx, id, target) for id in startable)
-            assert path is None or path.vertices[0] in startable
-            for avoid in startable[:1]:
-                detour = world.planner.path_to(point, target, avoid)
-                assert detour is None or detour.vertices[0] in set(startable) - {avoid}
+            useful = [id for id in startable if not graph.options[id].terminates(point[None])[0]]
+            assert graph.useful(point) == useful
+            assert (path is not None) == any(nx.has_path(graph.nx, id, target) for id in useful)
+            assert path is None or path.vertices[0] in useful
+            for avoid in ([*graph.options][:1], useful[:1], [*graph.options][1:3], useful):
+                check_detour(world, point, target, avoid)
+
+
+def check_detour(world: World, point: np.ndarray, target: str, avoid: list[str]) -> None:
+    """No plan runs through what has failed lately, unless nothing else leads there."""
+    graph = world.graph
+    detour, path = world.planner.path_to(point, target, avoid), world.planner.path_to(point, target)
+    remaining = graph.nx.subgraph(set(graph.nx) - set(avoid))
+    if any(nx.has_path(remaining, id, target) for id in graph.useful(point) if id not in avoid):
+        assert detour is not None
+        assert path is not None
+        assert not set(detour.vertices) & set(avoid)
+        assert nx.is_path(graph.nx, detour.vertices)
+        assert detour.vertices[0] in graph.useful(point)
+        assert detour.cost >= path.cost or math.isclose(detour.cost, path.cost)
+        assert math.isclose(detour.cost, nx.path_weight(graph.nx, detour.vertices, "weight"))
+    else:
+        assert detour == path
 
 
 # -- histories on a line, with discs for initiation sets --------------------------------------------------------------
@@ -209,6 +250,7 @@ def test_an_edge_exists_only_while_its_test_holds(mode: str, sequence: list[tupl
     for operation in sequence:
         history.apply(*operation)
         check_edges(history.graph)
+        check_regions(history.graph, history.graph.options.values())
 
 
 @every_mode
@@ -281,12 +323,15 @@ def test_chains_keep_the_graph_in_order(mode: str, sequence: list[tuple[int, int
         else:
             chaining.learn_failure(option, start)
         check_edges(graph)
+        check_regions(graph, options)
         assert set(graph.options) == {id for id, o in chaining.options.items() if o.mature} == set(world.matured)
         for chain in chaining.chains.values():
             ways = [chaining.options[id] for id in chain.options]
             assert all(o.mature for o in ways[:-1])
             assert [o.target for o in ways] == [chain.target, *chain.options[:-1]]
             assert not (chain.complete and not ways[0].mature)
+            startable = [way for way in ways if graph.nx.has_edge(chain.source, way.id)]
+            assert not (chain.complete and not startable) or chain is not chaining.chain_of[option.id]
     check_paths(graph)
     check_starts(world)
 

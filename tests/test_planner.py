@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from builders import World
 
-from sb3_skillgraph.planner import Status
+from sb3_skillgraph.planner import RETRACING, Status
 
 
 def at(x: float, y: float = 0.0) -> np.ndarray:
@@ -73,15 +73,42 @@ def test_no_plan_starts_outside_its_first_options_initiation_set(line: World) ->
 
 
 def test_a_detour_around_an_option_that_has_just_failed(line: World) -> None:
-    assert line.planner.path_to(at(0.0), "e1", avoid="o1") is None
+    only = line.planner.path_to(at(0.0), "e1")
+    assert only is not None
+    assert line.planner.path_to(at(0.0), "e1", avoid=["o1"]) == only  # nothing else leads there
     line.add_option(line.graph.events["e1"], (0.0, 0.0), failures=8)
-    best, second = line.planner.path_to(at(0.0), "e1"), line.planner.path_to(at(0.0), "e1", avoid="o1")
+    best, second = line.planner.path_to(at(0.0), "e1"), line.planner.path_to(at(0.0), "e1", avoid=["o1"])
     assert best is not None
     assert second is not None
     assert (best.vertices, second.vertices) == (("o1", "e1"), ("o5", "e1"))
     assert best.cost < second.cost
-    again = line.planner.path_to(at(0.0), "e1", avoid="o5")
-    assert again == best
+    assert second.success_probability == pytest.approx(9 / 18)
+    assert line.planner.path_to(at(0.0), "e1", avoid=["o5"]) == best
+    assert line.planner.path_to(at(0.0), "e1", avoid=["o5", "o1"]) == best  # nothing else leads there
+    assert line.planner.path_to(at(0.0), "e1", avoid=["o9"]) == best  # not in the graph
+
+
+def test_a_plan_never_runs_through_an_option_that_failed_lately_if_there_is_another_way(line: World) -> None:
+    """Wherever on the way it lies, and however dear the other way is."""
+    line.add_option(line.graph.events["e2"], (10.0, 0.0), failures=10)
+    first, second = line.planner.path_to(at(0.0), "e2"), line.planner.path_to(at(0.0), "e2", avoid=["o2"])
+    assert first is not None
+    assert second is not None
+    assert [id for id in first.vertices if id[0] == "o"] == ["o1", "o2"]
+    assert [id for id in second.vertices if id[0] == "o"] == ["o1", "o5"]
+    assert second.cost > first.cost
+    assert line.planner.path_to(at(0.0), "e2", avoid=["o2", "o5"]) == first
+    paths = [leg.path.vertices for leg in line.planner.legs(at(0.0), at(20.0), ["o2"]) if leg.path is not None]
+    assert paths
+    assert not any("o2" in path for path in paths)
+
+
+def test_an_option_that_would_end_at_once_begins_no_plan(line: World) -> None:
+    line.add_option(line.graph.events["e0"], (0.0, 0.0), successes=40)  # sure of what is so already
+    assert "o5" in line.graph.startable(at(0.0))
+    assert line.graph.useful(at(0.0)) == ["o1"]
+    path = line.planner.path_to(at(0.0), "e0")
+    assert path is None or path.vertices[0] == "o1"
 
 
 def test_event_at_is_the_nearest_event_that_holds_the_point(line: World) -> None:
@@ -120,12 +147,25 @@ def test_coming_back_from_a_goal_tells_less_than_going_there() -> None:
 def test_legs_are_sorted_and_add_up(line: World) -> None:
     legs = line.planner.legs(at(0.0), at(14.0))
     assert [leg.cost for leg in legs] == sorted(leg.cost for leg in legs)
-    assert [leg.event for leg in legs] == ["e1", "e2"]
+    assert sorted(str(leg.event) for leg in legs) == ["None", "e1", "e2"]
+    assert legs[0].event == "e1"
     first = legs[0]
     assert first.path is not None
     assert first.path.vertices == ("o1", "e1")
     steps = {event.id: n for event, n in line.planner.vertices_near(at(14.0))}
     assert first.cost == pytest.approx(first.path.cost + steps["e1"] / line.planner.reach)
+
+
+def test_a_long_way_retraced_costs_more_than_a_short_one() -> None:
+    world = World(reach=20)
+    world.walk((0, 0), (30, 0), 60)
+    for x in (2.0, 9.0, 10.5, 15.0, 29.0):
+        steps = world.visited.steps_between(at(0.0), at(x), 0.5)
+        [leg] = world.planner.legs(at(0.0), at(x))
+        assert (leg.event, leg.path) == (None, None)
+        assert leg.cost == pytest.approx(steps / 20 * (1.0 if steps <= 20 else RETRACING))
+    assert world.planner.legs(at(29.0), at(2.0)) == []  # nobody went back
+    assert world.planner.legs(at(0.0, 3.0), at(2.0)) == []  # nor from there
 
 
 def test_a_goal_close_at_hand_is_walked_to_directly(line: World) -> None:

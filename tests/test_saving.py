@@ -205,7 +205,7 @@ def test_parameters_have_sb3_names_and_grow_with_the_options(trained: SkillGraph
 def test_parameters_from_a_file(trained: SkillGraphAgent, trained_files: tuple[Path, Path]) -> None:
     expected = flat(trained.get_parameters())
     n_options = len(trained.options)
-    trained.learn(60, reset_num_timesteps=False)
+    trained.learn(20, reset_num_timesteps=False)
     assert len(trained.options) == n_options, "choose a shorter call: the file's parameters must still fit"
     assert differences(expected, flat(trained.get_parameters())) != []
     trained.set_parameters(str(trained_files[0]))

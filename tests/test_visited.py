@@ -117,6 +117,52 @@ def test_steps_between_agrees_with_brute_force(
     assert visited.steps_between(start, goal, radius) == oracle.steps_between(start, goal, radius)
 
 
+@given(moves, points, points, st.sampled_from([0.0, 0.6, 1.5]), st.integers(0, 6))
+@profile(120)
+def test_a_waypoint_lies_ahead_on_the_quickest_way(
+    sequence: list[Move], start: np.ndarray, goal: np.ndarray, radius: float, ahead: int
+) -> None:
+    visited = VisitedStates(2, SPACING, n_envs=3)
+    kept = (oracle := record_all(visited, sequence)).kept
+    quickest = oracle.steps_between(start, goal, radius)
+    passages = [
+        (i, j)
+        for i in oracle.near(start, radius)
+        for j in oracle.near(goal, radius)
+        if kept[i][0] == kept[j][0] and kept[j][1] - kept[i][1] == quickest
+    ]
+    allowed = set()
+    for i, j in passages:
+        between = [k for k in range(len(kept)) if kept[k][0] == kept[i][0] and kept[i][1] + ahead <= kept[k][1] < kept[j][1]]
+        between = [k for k in between if np.linalg.norm(kept[k][2] - start) > radius]
+        allowed.add(min(between, key=lambda k: kept[k][1], default=-1))
+    assert visited.waypoint(start, goal, radius, ahead) in (allowed or {-1})
+
+
+def test_waypoints_lead_around_a_corner_to_the_goal() -> None:
+    visited = VisitedStates(2, SPACING)
+    corridor = [(float(x), 0.0) for x in range(11)] + [(10.0, float(y)) for y in range(1, 11)]
+    for step, point in enumerate(corridor):
+        visited.record(0, step, np.array(point, dtype=np.float32))
+    at, goal, passed = np.array([0.4, 0.3]), np.array([10.0, 10.0]), []
+    while (k := visited.waypoint(at, goal, 0.5, 4)) >= 0:
+        passed.append(k)
+        at = visited.points[k].astype(np.float64)
+    assert passed == [4, 8, 12, 16]
+    assert visited.waypoint(np.array([10.0, 7.0]), goal, 0.5, 4) == -1  # the goal is as near
+    assert visited.waypoint(goal, np.zeros(2), 0.5, 4) == -1  # nobody went back
+    assert visited.waypoint(np.array([-50.0, 0.0]), goal, 0.5, 4) == 4  # from afar: by where the way begins
+
+
+def test_near_is_the_nearest_point_unless_exact() -> None:
+    visited = VisitedStates(2, SPACING)
+    straight(visited, 5)
+    for exact in (False, True):
+        assert visited.near(np.array([2.2, 0.0]), 1.0, exact).tolist() == [2, 3]
+    assert visited.near(np.array([9.0, 0.0]), 1.0).tolist() == [4]
+    assert visited.near(np.array([9.0, 0.0]), 1.0, exact=True).tolist() == []
+
+
 @pytest.mark.parametrize(("start", "goal"), [(0.0, 100.0), (-100.0, 4.0), (-100.0, 100.0), (-2.0, 0.0)])
 def test_no_steps_between_places_that_no_trajectory_came_near(start: float, goal: float) -> None:
     visited = VisitedStates(2, SPACING)
@@ -211,6 +257,7 @@ def test_nothing_visited() -> None:
     assert visited.events_before(np.zeros(2), 5.0) == {}
     assert visited.events_after(np.zeros(2), 5.0) == {}
     assert visited.steps_between(np.zeros(2), np.ones(2), 5.0) == np.inf
+    assert visited.waypoint(np.zeros(2), np.ones(2), 5.0, 3) == -1
 
 
 def straight(visited: VisitedStates, n: int, start: int = 0, y: float = 0.0) -> None:

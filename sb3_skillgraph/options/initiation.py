@@ -119,7 +119,8 @@ class InitiationSet:
             self.optimistic_boundaries.append(split)
             accepted = positives[split.inside(positives)]
             accepted = accepted if len(accepted) else positives
-        self.pessimistic_boundaries = [_one_class(accepted, 0.1, gamma)]
+        # What another option aims at must be somewhere this one can start: the core lies inside the optimistic set.
+        self.pessimistic_boundaries = [_one_class(accepted, 0.1, gamma), *self.optimistic_boundaries]
         self.core = self._deepest(accepted)
         return True
 

@@ -2,15 +2,29 @@
 
 import functools
 import warnings
-from typing import Any
+from typing import Any, ClassVar
 
 import torch as th
+from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.ddpg.ddpg import DDPG
 from stable_baselines3.td3.policies import TD3Policy
 from stable_baselines3.td3.td3 import TD3
 
 from sb3_skillgraph.options.fast_update import FastUpdate, why_not
+
+
+class OptionPolicy(TD3Policy):
+    """SB3's actor-critic of plain layers, which does not walk through all its modules when its mode stays as it is."""
+
+    def set_training_mode(self, mode: bool) -> None:
+        """
+        Put the networks in training or evaluation mode.
+
+        :param mode: True for training
+        """
+        if mode != self.training:
+            super().set_training_mode(mode)
 
 
 class OptionLearner(TD3):
@@ -23,6 +37,8 @@ class OptionLearner(TD3):
     :param critic_learning_rate: Adam's learning rate for the critics
     :param kwargs: all other arguments of the SB3 class except ``learning_rate``, which these two replace
     """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {**TD3.policy_aliases, "MlpPolicy": OptionPolicy}
 
     def __init__(
         self,

@@ -87,4 +87,4 @@ def save_figure(axes: Axes, path: str | Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     figure = axes.get_figure(root=True)
     assert figure is not None
-    figure.savefig(path, dpi=150)
+    figure.savefig(path, dpi=150, bbox_inches="tight")
