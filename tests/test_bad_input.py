@@ -74,12 +74,13 @@ class Hidden(gym.Wrapper):
         (lambda: Spaces(desired_goal=None), "desired_goal"),
         (lambda: Spaces(observation=spaces.Discrete(3)), "Box"),
         (lambda: Spaces(observation=spaces.Dict(x=spaces.Box(-1, 1))), ".*"),
+        (lambda: Spaces(clock=spaces.Discrete(51)), "Box"),  # an entry nobody asked for, but that could not be saved
         (lambda: Spaces(desired_goal=spaces.Box(-1.0, 1.0, (3,))), "same length"),
         (lambda: Spaces(action=spaces.Discrete(4)), "continuous actions"),
         (lambda: Spaces(action=spaces.MultiBinary(2)), "continuous actions"),
         (lambda: Spaces(action=spaces.Box(-np.inf, np.inf, (2,))), "finite"),
     ],
-    ids=["flat", "no goal", "discrete", "nested", "lengths", "Discrete", "MultiBinary", "unbounded"],
+    ids=["flat", "no goal", "discrete", "nested", "extra", "lengths", "Discrete", "MultiBinary", "unbounded"],
 )
 def test_environment_that_does_not_fit(env: Callable[[], gym.Env], message: str) -> None:
     with pytest.raises(ValueError, match=message):

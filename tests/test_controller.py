@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from builders import World
 
-from sb3_skillgraph.controller import GLOBAL, UNDECIDED, Controller, ControllerState, Request
+from sb3_skillgraph.controller import GLOBAL, MANY_DECISIONS, UNDECIDED, Controller, ControllerState, Request
 
 O1, O2, O3, O4 = 1, 2, 3, 4
 
@@ -249,6 +249,36 @@ def test_a_retraced_way_is_walked_waypoint_by_waypoint(corner: World) -> None:
     assert ends[-1][1] == -1
     assert len({aim for _, aim in ends}) == len(ends) > 2
     assert running.failures.tolist() == [0]
+
+
+def test_a_way_once_begun_is_walked_to_its_end(line: World) -> None:
+    """Where a plan over the graph would be cheaper, a walker that has just reached a waypoint goes on all the same."""
+    goal = Request(at(20.0)[0])
+    assert choose(line, 0.0, goal) == (O1, -1)
+    option, aim = line.controller.choose(at(0.0)[0], goal, 0, (), True)
+    assert option == GLOBAL
+    assert 0.0 < waypoint(line, aim)[0] < 20.0
+    for x, expected in ((0.0, GLOBAL), (0.1, GLOBAL)):
+        start = state(option=[GLOBAL], aim=[-2], steps=[1])
+        running, outcomes = line.controller.advance(start, at(x), [goal])
+        assert [outcome.success for outcome in outcomes] == [True]
+        _, _, running = line.controller.act(observe(at(x)), running, [goal])
+        assert running.option.tolist() == [expected]
+    failed, _ = line.controller.advance(state(option=[GLOBAL], aim=[-10], steps=[5]), at(0.0), [goal])
+    assert (failed.option.tolist(), failed.aim.tolist()) == ([UNDECIDED], [-1])  # after a failure it plans anew
+    _, _, running = line.controller.act(observe(at(0.0)), failed._replace(failures=np.zeros(1, dtype=int)), [goal])
+    assert running.option.tolist() == [O1]
+
+
+def test_going_round_in_circles_is_failing_too(line: World) -> None:
+    """After many decisions the next best way is tried."""
+    goal = Request(at(14.0)[0])
+    legs = line.planner.legs(at(0.0)[0], goal.goal)
+    for decisions, leg in ((0, 0), (MANY_DECISIONS - 1, 0), (MANY_DECISIONS, 1), (2 * MANY_DECISIONS, 2)):
+        _, _, running = line.controller.act(observe(at(0.0)), state(decisions=[decisions]), [goal])
+        path = legs[leg].path
+        assert running.option.tolist() == [GLOBAL if path is None else int(path.vertices[0][1:])]
+        assert running.decisions.tolist() == [decisions + 1]
 
 
 def test_a_waypoint_stays_where_it_is_when_old_trajectories_are_forgotten() -> None:

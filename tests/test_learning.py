@@ -78,7 +78,14 @@ def test_action_noise_is_what_explores(noise_class: type, n_envs: int) -> None:
 
 @pytest.mark.parametrize("n_envs", [1, 2])
 def test_the_paper_as_written(n_envs: int) -> None:
-    arguments = {**PAPER, **EAGER, "policy_kwargs": dict(net_arch=[16, 16]), "salient_event_freq": 2, "retry_after": 1}
+    arguments = {
+        **PAPER,
+        **EAGER,
+        "policy_kwargs": dict(net_arch=[16, 16]),
+        "salient_event_freq": 2,
+        "retry_after": 1,
+        "seed": 0,
+    }
     agent = SkillGraphAgent("MultiInputPolicy", new_vec_env(n_envs=n_envs, max_steps=60), **arguments).learn(1500)
     assert len(agent.events) >= 3
     assert agent.options
@@ -142,12 +149,19 @@ class Space(gym.Env):
         point = spaces.Box(-np.inf, np.inf, (3,), np.float64)
         observation = spaces.Box(-np.inf, np.inf, (2, 3), np.float64)
         entries = dict(observation=observation, achieved_goal=point, desired_goal=point)
-        self.observation_space = spaces.Dict({**entries, **({"clock": spaces.Discrete(51)} if extra else {})})
+        self.observation_space = spaces.Dict(
+            {**entries, **({"clock": spaces.Box(0.0, 51.0, (1,), np.float32)} if extra else {})}
+        )
         self.action_space = spaces.Box(-1.0, 1.0, (3, 1), np.float32)
 
     def _observe(self) -> dict[str, Any]:
         state = np.stack([self.position, self.velocity])
-        entries = dict(observation=state, achieved_goal=self.position.copy(), desired_goal=self.goal, clock=self.clock)
+        entries = dict(
+            observation=state,
+            achieved_goal=self.position.copy(),
+            desired_goal=self.goal,
+            clock=np.full(1, self.clock, np.float32),
+        )
         return {key: entries[key] for key in self.observation_space.spaces}
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:

@@ -91,8 +91,9 @@ def test_loading_without_env_then_set_env(trained_files: tuple[Path, Path]) -> N
     agent = SkillGraphAgent.load(trained_files[0])
     assert agent.get_env() is None
     agent.set_env(gym.make(TOY))
+    n_steps = agent.num_timesteps
     agent.learn(100, reset_num_timesteps=False)
-    assert agent.num_timesteps == 1600
+    assert agent.num_timesteps == n_steps + 100 >= 1600
 
 
 def test_loading_does_not_need_the_replay_buffer(trained_files: tuple[Path, Path]) -> None:
@@ -205,7 +206,7 @@ def test_parameters_have_sb3_names_and_grow_with_the_options(trained: SkillGraph
 def test_parameters_from_a_file(trained: SkillGraphAgent, trained_files: tuple[Path, Path]) -> None:
     expected = flat(trained.get_parameters())
     n_options = len(trained.options)
-    trained.learn(20, reset_num_timesteps=False)
+    trained.learn(5, reset_num_timesteps=False)
     assert len(trained.options) == n_options, "choose a shorter call: the file's parameters must still fit"
     assert differences(expected, flat(trained.get_parameters())) != []
     trained.set_parameters(str(trained_files[0]))
@@ -291,4 +292,6 @@ def test_nothing_is_left_open(tmp_path: Path) -> None:
 def test_what_is_in_a_file_is_all_there(trained_files: tuple[Path, Path]) -> None:
     state = state_in(*trained_files)
     assert set(state["agent"]["parameters"]) >= {"policy", "actor.optimizer", "critic.optimizer"}
-    assert len(state["replay"]["store"]["columns"]["action"]) == 1500
+    assert (
+        len(state["replay"]["store"]["columns"]["action"]) == state["agent"]["progress"]["counters"]["num_timesteps"] >= 1500
+    )
