@@ -219,7 +219,7 @@ class Controller:
             return self.option(index).subgoal
         if aim >= 0:
             return self.event(aim).center
-        return request.goal if aim == -1 else self.planner.visited.points[-2 - aim].astype(np.float64)
+        return request.goal if aim == -1 else self.planner.visited.point(-2 - aim)
 
     # -- choosing an option -------------------------------------------------------------------------------------------
 

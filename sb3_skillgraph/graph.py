@@ -133,8 +133,9 @@ class SkillGraph:
         outcomes.append(success)
         if self.evidence_edges:
             proven = (sum(outcomes) + 1.0) / (len(outcomes) + 2.0) >= 0.5
-            option.initiation.set_region(event.id, event.outline() if proven else None)
-            option.initiation.refit(force=True)
+            changed = option.initiation.set_region(event.id, event.outline() if proven else None)
+            if changed and option.initiation.refit(force=True) and option.id in self.options:
+                self.refresh(option, refitted=True)
 
     def refresh(self, option: Option, refitted: bool) -> None:
         """Bring the edges of one option up to date after one of its runs.

@@ -117,7 +117,7 @@ class GraphPlanner:
         unit = self.reach if self.nearest == "steps" else 2.0 * self.radius
         legs = []
         steps = self.visited.steps_between(point, goal, 0.5 * self.radius)
-        if np.isfinite(steps):
+        if np.isfinite(steps) and self.nearest == "steps":
             # Beyond the reach of one option, plans are surer than a long way retraced.
             legs.append(Leg(None, None, steps / self.reach * (1.0 if steps <= self.reach else RETRACING)))
         costs, paths = self.graph.paths_from(self.graph.useful(point), avoid)
@@ -137,7 +137,7 @@ class GraphPlanner:
         :param point: where the agent stands, shape ``(goal_dim,)``
         :param goal: shape ``(goal_dim,)``
         :param failures: approaches that have failed; after one, stretches are shorter
-        :return: index of a visited point; ``-1`` for the goal itself
+        :return: number of a visited point; ``-1`` for the goal itself
         """
         if self.nearest == "euclidean":
             return -1

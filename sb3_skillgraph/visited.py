@@ -26,6 +26,7 @@ class VisitedStates:
         self.spacing = spacing
         self.capacity = capacity
         self.size = 0
+        self.n_forgotten = 0
         self._points = np.zeros((1024, goal_dim), dtype=np.float32)
         self._trajectory = np.zeros(1024, dtype=np.int64)
         self._step = np.zeros(1024, dtype=np.int64)
@@ -90,6 +91,7 @@ class VisitedStates:
     def _forget_older_half(self) -> None:
         keep = slice(self.size // 2, self.size)
         n = self.size - self.size // 2
+        self.n_forgotten += self.size - n
         for name in ("_points", "_trajectory", "_step", "_label"):
             array = getattr(self, name)
             array[:n] = array[keep].copy()
@@ -206,7 +208,8 @@ class VisitedStates:
         :param goal: shape ``(goal_dim,)``
         :param radius: how near a trajectory must come, and how far the waypoint must be from the start at least
         :param ahead: environment steps the trajectory took to the waypoint at least
-        :return: index of a visited point; ``-1`` if the goal itself is as near, or no trajectory leads there
+        :return: number of a visited point (see :meth:`point`); ``-1`` if the goal itself is as near, or no trajectory
+            leads there
         """
         departure, arrival = self._passage(self.near(start, radius), self.near(goal, radius))
         if departure < 0:
@@ -216,7 +219,11 @@ class VisitedStates:
         indices = np.flatnonzero(way)
         far = np.linalg.norm(self.points[indices] - start, axis=1) > radius
         indices = indices[far]
-        return int(indices[step[indices].argmin()]) if len(indices) else -1
+        return self.n_forgotten + int(indices[step[indices].argmin()]) if len(indices) else -1
+
+    def point(self, number: int) -> np.ndarray:
+        """Return a visited point by its number, counted from the first ever visited; shape ``(goal_dim,)``."""
+        return self.points[max(number - self.n_forgotten, 0)].astype(np.float64)
 
     def _passage(self, here: np.ndarray, there: np.ndarray) -> tuple[int, int]:
         """Return from which of some points to which of others a trajectory went quickest, ``-1`` if none did."""
@@ -284,6 +291,7 @@ class VisitedStates:
             "current": self._current,
             "last_point": self._last_point,
             "n_trajectories": self._n_trajectories,
+            "n_forgotten": self.n_forgotten,
         }
 
     def set_state(self, state: dict[str, Any]) -> None:
@@ -295,7 +303,7 @@ class VisitedStates:
         self._label = np.full(self.size, -1, dtype=np.int32)
         self._current = np.array(state["current"], dtype=np.int64)
         self._last_point = np.array(state["last_point"], dtype=np.float32)
-        self._n_trajectories = int(state["n_trajectories"])
+        self._n_trajectories, self.n_forgotten = int(state["n_trajectories"]), int(state["n_forgotten"])
         self._passed = None
         if self.size == 0:
             self.__init__(self.goal_dim, self.spacing, len(self._current), self.capacity)  # type: ignore[misc]

@@ -83,17 +83,20 @@ class InitiationSet:
         self.failures.append(np.asarray(start, dtype=np.float64))
         self._n_news += 1
 
-    def set_region(self, name: str, points: np.ndarray | None) -> None:
+    def set_region(self, name: str, points: np.ndarray | None) -> bool:
         """Count a whole region as a place to start from, or no longer.
 
         :param name: name of the region (an event's id)
         :param points: points that stake it out, shape ``(n, goal_dim)``; None to take it away
+        :return: whether that changes anything
         """
+        changed = (name in self.regions) != (points is not None)
         if points is None:
-            self._n_news += self.regions.pop(name, None) is not None
+            self.regions.pop(name, None)
         else:
-            self._n_news += name not in self.regions
             self.regions[name] = np.asarray(points, dtype=np.float64)
+        self._n_news += changed
+        return changed
 
     def refit(self, force: bool = False) -> bool:
         """Fit the set to its examples, if enough of them are new.
