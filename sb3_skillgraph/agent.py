@@ -82,7 +82,7 @@ class SkillGraphAgent(Assembly):
     :param events_per_attempt: events sought per attempt [A.1.2: a pair]
     :param event_tries: proposals drawn per event until one is not redundant [A.1.1]
     :param event_reach: environment steps that a ``frontier`` event lies at most beyond the last event on its trajectory
-    :param max_unconnected: no events are sought while so many are not joined to the graph; None for no limit
+    :param max_unconnected: no events are sought while the chains that join so many are still open; None for no limit
     :param target_choice: ``"nearest"`` (the open chain whose source is cheapest to reach, the way back included) or
         ``"uniform"`` (any event [3.2.2])
     :param explore_prob: probability that a mission explores: to the event nearest to a random point, and beyond

@@ -24,7 +24,7 @@ class EventDiscovery:
     :param retry_after: R
     :param events_per_attempt: how many events an attempt proposes (the paper: a pair)
     :param n_tries: proposals drawn for each of them until one is accepted
-    :param max_unconnected: no attempt is made while so many events are not joined to the graph; None for no limit
+    :param max_unconnected: no attempt is made while the chains that join so many events are open; None for no limit
     """
 
     def __init__(
@@ -56,7 +56,7 @@ class EventDiscovery:
         """Tell whether an attempt is due.
 
         :param episode: number of completed episodes
-        :param connected: ids of the events joined to the graph
+        :param connected: ids of the events whose joining chain is complete or given up
         """
         n_unconnected = len(self.graph.events) - len(connected)
         if self.max_unconnected is not None and n_unconnected >= self.max_unconnected:
