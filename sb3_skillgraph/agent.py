@@ -321,7 +321,6 @@ class SkillGraphAgent(Assembly):
         with uninterrupted():
             self._learn_from_step(reached, dones, infos)
             self._last_obs = new_obs
-            self._last_original_obs = new_obs
             self._pending = None
             self._assign_missions()
 
@@ -400,6 +399,7 @@ class SkillGraphAgent(Assembly):
         """Write SB3's log entry, and the state of the graph under ``skillgraph/``."""
         for name, value in self.graph_summary().items():
             self.logger.record(f"skillgraph/{name}", value)
+        self.logger.record("skillgraph/rejected_events", self.discovery.n_rejected)
         super().dump_logs()
 
     def graph_summary(self) -> dict[str, float]:

@@ -50,7 +50,6 @@ class Option:
         self.n_successes = 0
         self.n_runs = 0
         self.record: deque[bool] = deque(maxlen=RECORD_LENGTH)
-        self.durations: deque[int] = deque(maxlen=RECORD_LENGTH)
         self.effects: deque[np.ndarray] = deque(maxlen=EFFECTS_LENGTH)
         self._actor: NumpyActor | None = None
 
@@ -115,7 +114,6 @@ class Option:
         if own:
             self.n_runs += 1
             self.record.append(True)
-            self.durations.append(len(path))
             self.effects.append(np.asarray(end, dtype=np.float64))
 
     def failed(self, start: np.ndarray) -> None:
@@ -136,7 +134,6 @@ class Option:
             "n_successes": self.n_successes,
             "n_runs": self.n_runs,
             "record": list(self.record),
-            "durations": list(self.durations),
             "effects": list(self.effects),
             "initiation": self.initiation.get_state(),
             "n_updates": self.learner._n_updates,
@@ -147,7 +144,6 @@ class Option:
         self.mature = state["mature"]
         self.n_successes, self.n_runs = state["n_successes"], state["n_runs"]
         self.record = deque(state["record"], maxlen=RECORD_LENGTH)
-        self.durations = deque(state["durations"], maxlen=RECORD_LENGTH)
         self.effects = deque(state["effects"], maxlen=EFFECTS_LENGTH)
         self.initiation.set_state(state["initiation"])
         self.learner._n_updates = state["n_updates"]

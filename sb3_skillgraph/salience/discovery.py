@@ -46,7 +46,6 @@ class EventDiscovery:
         self.events_per_attempt = events_per_attempt
         self.n_tries = n_tries
         self.max_unconnected = max_unconnected
-        self.n_accepted = 0
         self.n_rejected = 0
         self.last_accepted = 0  # episode
         self.last_rejected: int | None = None  # episode of an attempt of which nothing was accepted, if it was the last
@@ -106,12 +105,11 @@ class EventDiscovery:
         """
         event = SalientEvent(f"e{len(self.graph.events)}", center, self.radius)
         self.graph.add_event(event)
-        self.n_accepted += 1
         return event
 
     def get_state(self) -> dict[str, Any]:
         """Return the counters as plain data."""
-        names = ("n_accepted", "n_rejected", "last_accepted", "last_rejected", "newest")
+        names = ("n_rejected", "last_accepted", "last_rejected", "newest")
         return {name: getattr(self, name) for name in names}
 
     def set_state(self, state: dict[str, Any]) -> None:
