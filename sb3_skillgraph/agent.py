@@ -171,6 +171,8 @@ class SkillGraphAgent(Assembly):
         # The keyword arguments as given: what is saved, and what load() builds the agent from.
         self._arguments = {k: v for k, v in locals().items() if k not in ("self", "env", "_init_setup_model", "__class__")}
         _refuse(replay_buffer_class, replay_buffer_kwargs, optimize_memory_usage, n_steps, use_sde)
+        if isinstance(policy, str) and policy not in self.policy_aliases:
+            raise ValueError(f"Unknown policy {policy!r}: goal environments have Dict observations, use 'MultiInputPolicy'.")
         refuse_vec_normalize(env)
         if env is not None and not isinstance(env, str):
             GoalSpec.of(env.observation_space, env.action_space)  # before SB3 asserts less clearly

@@ -121,6 +121,11 @@ def test_unknown_salience_names_the_known() -> None:
         new_agent(salience="curiosity")
 
 
+def test_policy_for_flat_observations_names_the_right_one() -> None:
+    with pytest.raises(ValueError, match=r"'MlpPolicy'.*'MultiInputPolicy'"):
+        SkillGraphAgent("MlpPolicy", gym.make(TOY))
+
+
 def test_rrt_without_an_oracle() -> None:
     with pytest.raises(ValueError, match=r"sample_free.*frontier"):
         new_agent(Hidden(gym.make(TOY), "sample_free"), salience="rrt")
