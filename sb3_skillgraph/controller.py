@@ -261,7 +261,7 @@ class Controller:
         if path is not None:
             return self.index(self._first(path)), -1
         entry = self.planner.entry(point, event) or self.planner.graph.events[event]
-        return self._retrace(point, entry.center, int(entry.id[1:]), failures)
+        return self._walk_to(point, entry, failures)
 
     def _to_goal(self, point: np.ndarray, goal: np.ndarray, failures: int, avoid: Collection[str]) -> tuple[int, int]:
         """Follow the cheapest way to a goal; after a failed approach, the next cheapest."""
@@ -271,12 +271,13 @@ class Controller:
             return self._retrace(point, goal, -1, failures) if path is None else (self.index(self._first(path)), -1)
         nearest = self.planner.vertices_near(goal)
         entry = self.planner.entry(point, nearest[0][0].id) if nearest else None
-        if entry is None:
-            return self._retrace(point, goal, -1, failures)
-        return self._retrace(point, entry.center, int(entry.id[1:]), failures)
+        return self._retrace(point, goal, -1, failures) if entry is None else self._walk_to(point, entry, failures)
 
     def _first(self, path: GraphPath) -> Option:
         return self.chaining.options[path.vertices[0]]
+
+    def _walk_to(self, point: np.ndarray, event: SalientEvent, failures: int) -> tuple[int, int]:
+        return self._retrace(point, event.center, int(event.id[1:]), failures)
 
     def _retrace(self, point: np.ndarray, goal: np.ndarray, aim: int, failures: int) -> tuple[int, int]:
         """Walk to a goal by the global option, along a way that has been gone before if there is one."""
