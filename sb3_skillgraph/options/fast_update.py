@@ -129,23 +129,28 @@ class Network:
         for i in range(len(self.layers) - 1, -1, -1):
             gradients[:0] = self.layers[i].parameter_gradients(values[i], gradient)
             if i > 0:
-                gradient = self._through_relu(i, values, gradient)
+                gradient = self.layers[i].input_gradient(gradient)
+                th.ops.aten.threshold_backward.grad_input(gradient, values[i], 0, grad_input=gradient)
         return gradients
 
-    def input_gradient(self, values: list[th.Tensor], gradient: th.Tensor, start: int) -> th.Tensor:
+    def slope(self, values: list[th.Tensor], scale: float, start: int) -> th.Tensor:
         """
+        How ``scale`` times the sum of what a network with one output returned changes with its input.
+
         :param values: what ``forward`` returned
-        :param gradient: (batch, out), of the loss by the network's result
+        :param scale: a factor
         :param start: the first column of the input that is asked for
         :return: (batch, in - start)
         """
-        for i in range(len(self.layers) - 1, 0, -1):
-            gradient = self._through_relu(i, values, gradient)
-        return th.mm(self.layers[0].weight[:, start:].t(), gradient.t()).t()
-
-    def _through_relu(self, i: int, values: list[th.Tensor], gradient: th.Tensor) -> th.Tensor:
-        gradient = self.layers[i].input_gradient(gradient)
-        return th.ops.aten.threshold_backward.grad_input(gradient, values[i], 0, grad_input=gradient)
+        gradient = self.layers[-1].weight.mul(scale).expand(len(values[0]), -1)
+        for i in range(len(self.layers) - 2, -1, -1):
+            gradient = th.ops.aten.threshold_backward.default(gradient, values[i + 1], 0)
+            if i > 0:
+                gradient = self.layers[i].input_gradient(gradient)
+            else:
+                # Narrow again, and only the columns asked for.
+                return th.mm(self.layers[0].weight[:, start:].t(), gradient.t()).t()
+        return gradient[:, start:]
 
 
 class Adam:
@@ -249,14 +254,15 @@ class FastUpdate:
         """
         inputs = th.cat([_flat(data.observations), data.actions], dim=1)
         target = self._target(data, gamma, noise_std, noise_clip)
-        loss, gradients = th.zeros((), device=inputs.device), []
+        losses: list[th.Tensor] = []
+        gradients: list[th.Tensor] = []
         for critic in self.critics:
             values = critic.forward(inputs)
-            error = values[-1] - target
-            loss += th.dot(error[:, 0], error[:, 0]) / len(error)
-            gradients += critic.parameter_gradients(values, error.mul_(2 / len(error)))
+            losses.append(th.ops.aten.mse_loss.default(values[-1], target))
+            error = th.sub(values[-1], target).mul_(2 / len(target))
+            gradients += critic.parameter_gradients(values, error)
         self.critic_adam.step(gradients)
-        return loss, inputs
+        return losses[0] if len(losses) == 1 else th.stack(losses).sum(), inputs
 
     def update_actor(self, inputs: th.Tensor) -> th.Tensor:
         """
@@ -271,8 +277,7 @@ class FastUpdate:
         actions = values[-1].tanh_()
         inputs[:, start:] = actions
         critic_values = critic.forward(inputs)
-        ascent = th.full_like(critic_values[-1], -1 / len(inputs))
-        gradient = th.ops.aten.tanh_backward.default(critic.input_gradient(critic_values, ascent, start), actions)
+        gradient = th.ops.aten.tanh_backward.default(critic.slope(critic_values, -1 / len(inputs), start), actions)
         self.actor_adam.step(self.actor.parameter_gradients(values, gradient))
         return -critic_values[-1].mean()
 
@@ -295,8 +300,8 @@ class FastUpdate:
         next_values = self.critic_targets[0].forward(inputs)[-1]
         for critic in self.critic_targets[1:]:
             next_values = th.minimum(next_values, critic.forward(inputs)[-1])
-        discounts = gamma if data.discounts is None else data.discounts
-        return (data.rewards + (1 - data.dones) * discounts * next_values).float()
+        discounted = (1 - data.dones).mul_(gamma if data.discounts is None else data.discounts)
+        return th.addcmul(data.rewards, discounted, next_values).float()
 
 
 def why_not(policy: Any) -> str | None:
