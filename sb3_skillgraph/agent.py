@@ -5,23 +5,26 @@ from typing import Any, ClassVar, Literal, NamedTuple, TypeVar
 
 import numpy as np
 import torch as th
+from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 from stable_baselines3.td3.policies import MultiInputPolicy
 
 from sb3_skillgraph.assembly import Assembly
 from sb3_skillgraph.controller import GLOBAL, ControllerState, Request
 from sb3_skillgraph.goal_env import KEYS, GoalSpec, as_batch, as_goal, check_finite, refuse_vec_normalize, rows, with_terminal
-from sb3_skillgraph.interrupts import uninterrupted
+from sb3_skillgraph.interrupts import Interrupts
 from sb3_skillgraph.options.learner import OptionDDPG
 from sb3_skillgraph.options.option import Option
 from sb3_skillgraph.options.views import View
 from sb3_skillgraph.planner import Plan
 from sb3_skillgraph.salience.proposals import Salience
+from sb3_skillgraph.vec_env import LeanVecEnv
 
 SelfSkillGraphAgent = TypeVar("SelfSkillGraphAgent", bound="SkillGraphAgent")
 
@@ -201,10 +204,18 @@ class SkillGraphAgent(Assembly):
         self._random_action_prob = random_action_prob
         self._random_hold = random_hold
         self._reset_options: dict[str, Any] = {}  # while adapting: where episodes start
+        self._interrupts = Interrupts()
         if self.env is not None:
             self._spec = GoalSpec.of(self.observation_space, self.action_space)
         if _init_setup_model:
             self._setup_model()
+
+    @staticmethod
+    def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
+        wrapped = OffPolicyAlgorithm._wrap_env(env, verbose, monitor_wrapper)
+        if type(wrapped) is DummyVecEnv and wrapped is not env and isinstance(wrapped.observation_space, spaces.Dict):
+            return LeanVecEnv(wrapped.envs)
+        return wrapped
 
     # -- learning: SB3's hooks ----------------------------------------------------------------------------------------
 
@@ -230,7 +241,8 @@ class SkillGraphAgent(Assembly):
         :return: the agent
         :raises ValueError: if an observation holds NaN or inf
         """
-        return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)  # type: ignore[arg-type]
+        with self._interrupts.watched():
+            return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)  # type: ignore[arg-type]
 
     def _setup_learn(
         self,
@@ -280,11 +292,11 @@ class SkillGraphAgent(Assembly):
         """Let the running options act, with noise; nothing is kept until the step is stored."""
         assert isinstance(self._last_obs, dict)
         rng_state = self.rng.bit_generator.state
-        observation = {key: rows(self._last_obs, key) for key in KEYS}
+        observation = {key: rows(self._last_obs, key) for key in ("observation", "achieved_goal")}
         requests = [mission.request for mission in self.curriculum.missions]
         scaled, aims, state = self.controller.act(observation, self._state, requests)
         scaled, held, hold_left = self._explore(scaled, action_noise)
-        self._pending = _Pending(observation, scaled, aims, state, held, hold_left, rng_state)
+        self._pending = _Pending(observation, requests, scaled, aims, state, held, hold_left, rng_state)
         return self._factory.unscale(scaled).reshape((n_envs, *self._action_space().shape)), scaled
 
     def _explore(self, scaled: np.ndarray, action_noise: ActionNoise | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -293,15 +305,16 @@ class SkillGraphAgent(Assembly):
             scaled = scaled + action_noise()
         elif self._exploration_noise:
             scaled = scaled + self.rng.normal(0.0, self._exploration_noise, scaled.shape)
-        held, hold_left = self._held_actions.copy(), self._hold_left.copy()
+        held, hold_left = self._held_actions, self._hold_left.copy()
         for i, mission in enumerate(self.curriculum.missions):
             if hold_left[i] == 0 and (mission.random_walk or self.rng.random() < self._random_action_prob / self._random_hold):
+                held = held.copy()
                 held[i] = self.rng.uniform(-1.0, 1.0, held[i].shape)
                 hold_left[i] = self.rng.integers(1, 2 * self._random_hold)
             if hold_left[i] > 0:
                 scaled[i] = held[i]
                 hold_left[i] -= 1
-        return np.clip(scaled, -1.0, 1.0).astype(np.float32), held, hold_left
+        return scaled.clip(-1.0, 1.0).astype(np.float32), held, hold_left
 
     def _store_transition(
         self,
@@ -320,7 +333,7 @@ class SkillGraphAgent(Assembly):
         check_finite(new_obs, self.num_timesteps)
         if reached is not new_obs:
             check_finite(reached, self.num_timesteps)
-        with uninterrupted():
+        with self._interrupts:
             self._learn_from_step(reached, dones, infos)
             self._last_obs = new_obs
             self._pending = None
@@ -351,22 +364,21 @@ class SkillGraphAgent(Assembly):
             dones & ~truncated,
             dones,
         )
-        requests = [mission.request for mission in self.curriculum.missions]
         self._held_actions, self._hold_left = step.held_actions, step.hold_left
-        self._state, outcomes = self.controller.advance(step.state, points, requests)
+        self._state, outcomes = self.controller.advance(step.state, points, step.requests)
         by_env = {outcome.env: outcome for outcome in outcomes}
-        self._executed = sorted({int(index) for index in step.state.option})
-        for i in range(self.n_envs):
-            index = int(step.state.option[i])
+        options = step.state.option.tolist()
+        self._executed = sorted(set(options))
+        over = np.zeros(self.n_envs, dtype=bool)
+        for i, (index, done) in enumerate(zip(options, dones.tolist(), strict=True)):
             if index != GLOBAL:
                 self.controller.option(index).replay.add_rows(row[i : i + 1])
-            self.visited.record(i, self.num_timesteps, points[i], bool(dones[i]))
-            if self.curriculum.observe(i, before[i], points[i], by_env.get(i), bool(dones[i])):
-                fresh = ControllerState.fresh(1)
-                for kept, forgotten in zip(self._state, fresh, strict=True):
-                    kept[i] = forgotten[0]
-            if dones[i]:
+            self.visited.record(i, self.num_timesteps, points[i], done)
+            over[i] = self.curriculum.observe(i, before[i], points[i], by_env.get(i), done)
+            if done:
                 self._hold_left[i] = 0
+        if over.any():
+            self._state = self._state.begun_anew(over)
 
     def train(self, gradient_steps: int, batch_size: int = 100) -> None:
         """
@@ -446,12 +458,9 @@ class SkillGraphAgent(Assembly):
         """
         batch, vectorized = as_batch(observation, self.observation_space)
         n_envs = len(batch["achieved_goal"])
-        running = ControllerState.fresh(n_envs) if state is None else ControllerState(*state).copy()
-        if episode_start is not None:
-            fresh = ControllerState.fresh(n_envs)
-            running = ControllerState(
-                *(np.where(np.asarray(episode_start, dtype=bool), new, old) for new, old in zip(fresh, running, strict=True))
-            )
+        running = ControllerState.fresh(n_envs) if state is None else ControllerState(*state)
+        if episode_start is not None and np.any(episode_start):
+            running = running.begun_anew(np.asarray(episode_start, dtype=bool))
         requests = [Request(goal) for goal in batch["desired_goal"]]
         running, _ = self.controller.advance(running, batch["achieved_goal"], requests)
         scaled, _, running = self.controller.act(batch, running, requests)
@@ -510,6 +519,7 @@ class _Pending(NamedTuple):
     """A step between its taking and its storing."""
 
     observation: dict[str, np.ndarray]
+    requests: list[Request]
     action: np.ndarray
     aims: np.ndarray
     state: ControllerState

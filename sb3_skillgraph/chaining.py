@@ -113,7 +113,7 @@ class DeepSkillChaining:
         options = [self.options[id] for id in chain.options]
         for option in options:
             startable = not option.mature or bool(option.initiation.optimistic(point[None])[0])
-            if startable and not option.terminates(point[None])[0]:
+            if startable and not option.terminates(point):
                 return option
         return options[-1]
 
@@ -146,7 +146,7 @@ class DeepSkillChaining:
         chain = self.chain_of[option.id]
         source = self.graph.events[chain.source]
         for event in self.graph.events.values():
-            if event.id != option.target and event.contains(start[None])[0]:
+            if event.id != option.target and event.holds(start):
                 self.graph.ran_from(event, option, success)
         refitted = option.initiation.refit(force=not option.mature)
         if option.mature:

@@ -1,12 +1,13 @@
 """Which option runs, for how long, and what it does: one environment step at a time (sections 3.2.4, 3.2.5, A.6)."""
 
+import math
 from collections.abc import Collection, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from sb3_skillgraph.chaining import DeepSkillChaining
-from sb3_skillgraph.events import SalientEvent, TerminationSet
+from sb3_skillgraph.events import SalientEvent
 from sb3_skillgraph.graph import GraphPath
 from sb3_skillgraph.options.execution import Fate, fate
 from sb3_skillgraph.options.numpy_actor import NumpyActor
@@ -29,6 +30,8 @@ class ControllerState(NamedTuple):
     :param failed_last: index of the option that failed last on the way to the goal, ``-1`` for none
     :param failed_before: index of the one that failed before it, ``-1`` for none
     :param decisions: options chosen so far on the way to the goal
+
+    States are never changed in place: the one before and the one after a step may share arrays.
     """
 
     option: np.ndarray
@@ -44,6 +47,14 @@ class ControllerState(NamedTuple):
         """Return the state at the start of an episode."""
         none, zero = np.full(n_envs, -1), np.zeros(n_envs, dtype=np.int64)
         return cls(np.full(n_envs, UNDECIDED), zero, none, zero.copy(), none.copy(), none.copy(), zero.copy())
+
+    def begun_anew(self, where: np.ndarray) -> "ControllerState":
+        """Return a state that is fresh for some environments.
+
+        :param where: for which, bool array of shape ``(n_envs,)``
+        """
+        fresh = self.fresh(len(where))
+        return ControllerState(*(np.where(where, new, old) for new, old in zip(fresh, self, strict=True)))
 
     def copy(self) -> "ControllerState":
         """Return a copy that shares no memory."""
@@ -148,32 +159,37 @@ class Controller:
         :param requests: what each is to do
         :return: the state, undecided where an option ended; one outcome per option that ended
         """
-        state, outcomes = state.copy(), []
-        for i in np.flatnonzero(state.option != UNDECIDED).tolist():
-            index, aim, steps = int(state.option[i]), int(state.aim[i]), int(state.steps[i])
-            timeout = self.timeout if index != GLOBAL else self.timeout // 2
-            ended = fate(self._termination(index, aim, requests[i]), points[i], steps, timeout)
-            if ended == Fate.RUNNING:
+        ended: list[tuple[int, Fate]] = []
+        for i, (index, aim, steps) in enumerate(zip(state.option.tolist(), state.aim.tolist(), state.steps.tolist(), strict=True)):
+            if index == UNDECIDED:
                 continue
-            success = ended == Fate.SUCCEEDED
-            outcomes.append(OptionOutcome(i, index, aim, success, steps))
-            state.option[i] = UNDECIDED
-            if not success:
-                state.aim[i] = -1  # so that no way is retraced further
-            if not success and index == GLOBAL:
-                state.failures[i] += aim < 0
-            elif not success and index != state.failed_last[i]:
-                state.failed_before[i], state.failed_last[i] = state.failed_last[i], index
-        return state, outcomes
+            timeout = self.timeout if index != GLOBAL else self.timeout // 2
+            what = fate(self._reached(index, aim, requests[i], points[i]), steps, timeout)
+            if what != Fate.RUNNING:
+                ended.append((i, what))
+        if not ended:
+            return state, []
+        state = state.copy()
+        return state, [self._end(state, i, what == Fate.SUCCEEDED) for i, what in ended]
 
-    def _termination(self, index: int, aim: int, request: Request) -> TerminationSet:
+    def _reached(self, index: int, aim: int, request: Request, point: np.ndarray) -> bool:
         if index != GLOBAL:
-            termination = self.option(index).termination
-            assert termination is not None
-            return termination
+            return self.option(index).terminates(point)
         if aim >= 0:
-            return self.event(aim)
-        return SalientEvent("goal", self._aim(index, aim, request), self.radius if aim == -1 else self.tolerance)
+            return self.event(aim).holds(point)
+        radius = self.radius if aim == -1 else self.tolerance
+        return math.dist(point.tolist(), self._aim(index, aim, request).tolist()) <= radius
+
+    def _end(self, state: ControllerState, i: int, success: bool) -> OptionOutcome:
+        index, aim = int(state.option[i]), int(state.aim[i])
+        state.option[i] = UNDECIDED
+        if not success:
+            state.aim[i] = -1  # so that no way is retraced further
+        if not success and index == GLOBAL:
+            state.failures[i] += aim < 0
+        elif not success and index != state.failed_last[i]:
+            state.failed_before[i], state.failed_last[i] = state.failed_last[i], index
+        return OptionOutcome(i, index, aim, success, int(state.steps[i]))
 
     def act(
         self,
@@ -189,9 +205,11 @@ class Controller:
         :return: actions scaled to [-1, 1], shape ``(n_envs, action_dim)``; the points the options aim at, shape
             ``(n_envs, goal_dim)``; the state after the step
         """
-        state = state.copy()
         points = observation["achieved_goal"]
-        for i in np.flatnonzero(state.option == UNDECIDED).tolist():
+        undecided = np.flatnonzero(state.option == UNDECIDED).tolist()
+        if undecided:
+            state = state.copy()
+        for i in undecided:
             failed = {int(state.failed_last[i]), int(state.failed_before[i])}
             # Going round in circles is failing, too.
             failures = int(state.failures[i] + state.decisions[i] // MANY_DECISIONS)
@@ -199,15 +217,14 @@ class Controller:
             state.option[i], state.aim[i] = self.choose(points[i], requests[i], failures, failed, retracing)
             state.decisions[i] += 1
             state.steps[i] = 0
-        aims = np.stack([self._aim(int(o), int(a), r) for o, a, r in zip(state.option, state.aim, requests, strict=True)])
+        options = state.option.tolist()
+        aims = np.array([self._aim(*what) for what in zip(options, state.aim.tolist(), requests, strict=True)])
         seen = self.view(observation["observation"], points, aims)
-        actors = [self._actor(int(index)) for index in state.option]
-        if len(actors) == 1:
-            actions = actors[0].act(seen)
+        if len(options) == 1:
+            actions = self._actor(options[0]).act(seen)
         else:
-            actions = np.concatenate([actor.act(seen[i : i + 1]) for i, actor in enumerate(actors)])
-        state.steps[:] += 1
-        return actions, aims, state
+            actions = np.concatenate([self._actor(index).act(seen[i : i + 1]) for i, index in enumerate(options)])
+        return actions, aims, state._replace(steps=state.steps + 1)
 
     def _actor(self, index: int) -> NumpyActor:
         option = self.option(index)
@@ -251,7 +268,7 @@ class Controller:
         assert request.chain is not None
         chain = self.chaining.chains[request.chain]
         source = self.planner.graph.events[chain.source]
-        if request.left_graph or source.contains(point[None])[0]:
+        if request.left_graph or source.holds(point):
             return self.index(self.chaining.admissible(chain, point)), -1
         return self._towards(point, source.id, failures, avoid)
 

@@ -1,5 +1,6 @@
 """What the agent does while it learns: which target to pursue, and what each run teaches (sections 3.2.1-3.2.7)."""
 
+import math
 from dataclasses import asdict, dataclass
 from typing import Any, Literal, NamedTuple
 
@@ -132,7 +133,7 @@ class Curriculum:
             mission = self._missions[env] = self._random_walk() if warm_up else self._choose(point)
         if mission.chain is not None and not mission.left_graph:
             source = self.graph.events[self.chaining.chains[mission.chain].source]
-            mission.left_graph = bool(source.contains(point[None])[0])
+            mission.left_graph = source.holds(point)
 
     def cut(self, n_envs: int) -> None:
         """Forget what every environment was in the middle of: they have been reset.
@@ -177,7 +178,7 @@ class Curriculum:
 
         :param env: which environment
         :param before: where its agent stood, shape ``(goal_dim,)``
-        :param after: where it stands now (the last state of the episode, if it ended)
+        :param after: where it stands now (the last state of the episode, if it ended), as :class:`VisitedStates` has it
         :param outcome: what became of the option it ran, if that ended
         :param done: whether the episode ended
         :return: whether the running option must be cut short, since the mission has changed
@@ -215,7 +216,7 @@ class Curriculum:
         if mission.exploring:
             mission.explore_steps -= 1
             return mission.explore_steps <= 0
-        if np.linalg.norm(point - mission.goal) > self.discovery.radius:
+        if math.dist(point.tolist(), mission.goal.tolist()) > self.discovery.radius:
             return mission.n_failures >= self.strategy.max_tries
         mission.exploring = mission.explore_steps > 0
         return not mission.exploring
@@ -224,16 +225,16 @@ class Curriculum:
 
     def _track_events(self, env: int, before: np.ndarray, after: np.ndarray) -> None:
         """Note which events a trajectory passes: every crossing shows a way, whatever option was running."""
-        if self._last_event[env] is None:
+        if not self._since_event[env] and self._last_event[env] is None:
             here = self.planner.event_at(before)
             self._last_event[env] = None if here is None else here.id
         if len(self._since_event[env]) > self.timeout:
             self._since_event[env], self._last_event[env] = [], None
         self._since_event[env].append(before)
-        event = self.planner.event_at(after)
-        if event is None:
+        index = self.visited.event(env)
+        if index < 0:
             return
-        previous = self._last_event[env]
+        event, previous = self.graph.events[f"e{index}"], self._last_event[env]
         if event.id != previous:
             self.graph.triggered(event, after)
             if previous is not None:
@@ -301,7 +302,7 @@ class Curriculum:
 
     def _to_event(self, point: np.ndarray, event: SalientEvent) -> Mission:
         """Pursue an event: over the graph if a path leads there, else by the chain from the vertex nearest to it."""
-        if event.contains(point[None])[0]:
+        if event.holds(point):
             return self._explore()
         if self.planner.path_to(point, event.id) is not None:
             return self._mission(event, None)
@@ -313,7 +314,7 @@ class Curriculum:
         for chain in list(self.chaining.chains.values()):
             if chain.complete:
                 self.chaining.open_chain(self.graph.events[chain.target], self.graph.events[chain.source])
-        events = [event for event in self.graph.events.values() if not event.contains(point[None])[0]]
+        events = [event for event in self.graph.events.values() if not event.holds(point)]
         if not events:
             return self._explore()
         return self._to_event(point, events[self.rng.integers(len(events))])
@@ -323,12 +324,14 @@ class Curriculum:
 
         def cost(chain: SkillChain) -> tuple[float, int]:
             source = self.graph.events[chain.source]
-            path = None if source.contains(point[None])[0] else self.planner.path_to(point, chain.source)
-            travel = 0.0 if source.contains(point[None])[0] else float("inf") if path is None else path.cost
+            travel = 0.0
+            if not source.holds(point):
+                path = self.planner.path_to(point, chain.source)
+                travel = math.inf if path is None else path.cost
             return travel + (0.0 if chain.joins else JOINED_ALREADY), chain.n_failures
 
         events = self.graph.events
-        chains = [c for c in self.chaining.open_chains() if not events[c.target].contains(point[None])[0]]
+        chains = [c for c in self.chaining.open_chains() if not events[c.target].holds(point)]
         return min(chains, key=cost, default=None)
 
     def _random_walk(self) -> Mission:

@@ -1,5 +1,6 @@
 """Salient events: the states an agent has decided are worth reaching."""
 
+import math
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -14,6 +15,12 @@ class TerminationSet(Protocol):
 
         :param points: float array of shape ``(n, goal_dim)``
         :return: bool array of shape ``(n,)``
+        """
+
+    def holds(self, point: np.ndarray) -> bool:
+        """Tell whether a single point lies inside: the question of every step, where batches cost too much.
+
+        :param point: shape ``(goal_dim,)``
         """
 
 
@@ -38,6 +45,7 @@ class SalientEvent:
         if not self.radius > 0:
             raise ValueError(f"Event {self.id!r} needs a positive radius, not {self.radius!r}.")
         object.__setattr__(self, "center", center)
+        object.__setattr__(self, "_coordinates", center.tolist())
 
     def contains(self, points: np.ndarray) -> np.ndarray:
         """Tell which points trigger the event.
@@ -47,6 +55,13 @@ class SalientEvent:
         """
         offsets = np.asarray(points, dtype=np.float64) - self.center
         return np.einsum("ij,ij->i", offsets, offsets) <= self.radius**2
+
+    def holds(self, point: np.ndarray) -> bool:
+        """Tell whether a single point triggers the event.
+
+        :param point: shape ``(goal_dim,)``
+        """
+        return math.dist(point.tolist(), self._coordinates) <= self.radius  # type: ignore[attr-defined]
 
     def outline(self) -> np.ndarray:
         """Return points that stake out the event: its centre, and its rim along every axis; shape ``(n, goal_dim)``."""

@@ -224,7 +224,7 @@ class SkillGraph:
 
         :param point: shape ``(goal_dim,)``
         """
-        return [id for id in self.startable(point) if not self.options[id].terminates(np.asarray(point)[None])[0]]
+        return [id for id in self.startable(point) if not self.options[id].terminates(np.asarray(point))]
 
     def costs_to(self, target: str) -> dict[str, float]:
         """Return the cost of the cheapest path from every vertex that has one to ``target`` (cached)."""

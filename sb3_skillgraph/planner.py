@@ -122,7 +122,7 @@ class GraphPlanner:
             legs.append(Leg(None, None, steps / self.reach * (1.0 if steps <= self.reach else RETRACING)))
         costs, paths = self.graph.paths_from(self.graph.useful(point), avoid)
         for event, distance in self.vertices_near(goal):
-            if event.contains(point[None])[0]:
+            if event.holds(point):
                 legs.append(Leg(None, None, distance / unit))
             elif event.id in costs:
                 path = self._path(paths[event.id], costs[event.id])
@@ -156,7 +156,7 @@ class GraphPlanner:
         """
         costs = self.graph.costs_to(target) if target is not None else dict.fromkeys(self.graph.events, 0.0)
         for event, _ in self._ranked(point, self.visited.events_after, self.visited.events_before):
-            if event.id in costs and not event.contains(point[None])[0]:
+            if event.id in costs and not event.holds(point):
                 return event
         return None
 
@@ -167,7 +167,7 @@ class GraphPlanner:
         :param radius: radius of the goal region, in goal units
         """
         region = SalientEvent("goal", goal, radius)
-        if any(region.contains(event.center[None])[0] for event in self.graph.events.values()) or any(
+        if any(region.holds(event.center) for event in self.graph.events.values()) or any(
             option.effects and region.contains(np.stack(option.effects)).mean() >= self.graph.containment
             for option in self.graph.options.values()
         ):

@@ -31,9 +31,10 @@ class TransitionStore:
         self.capacity = max(capacity // n_envs, 1) * n_envs
         self.n_envs = n_envs
         self.total = 0
-        dims = (observation_dim, goal_dim, observation_dim, goal_dim, action_dim, goal_dim)
-        # np.zeros is lazy: memory is taken only as rows are written.
-        self._data = {k: np.zeros((self.capacity, d), dtype=np.float32) for k, d in zip(_COLUMNS, dims, strict=True)}
+        ends = np.cumsum([observation_dim, goal_dim, observation_dim, goal_dim, action_dim, goal_dim]).tolist()
+        self._slices = {name: slice(start, end) for name, start, end in zip(_COLUMNS, [0, *ends], ends, strict=False)}
+        # All columns side by side: a minibatch is gathered once. np.zeros is lazy: memory is taken as rows are written.
+        self._data = np.zeros((self.capacity, ends[-1]), dtype=np.float32)
         self._terminated = np.zeros(self.capacity, dtype=bool)
         self._trajectory = np.zeros(self.capacity, dtype=np.int64)
         self._current = np.arange(n_envs, dtype=np.int64)
@@ -74,16 +75,15 @@ class TransitionStore:
         position = self.total % self.capacity
         block = slice(position, position + self.n_envs)
         values = (observation, achieved_goal, next_observation, next_achieved_goal, action, goal)
-        for name, value in zip(_COLUMNS, values, strict=True):
-            self._data[name][block] = value
+        np.concatenate(values, axis=1, out=self._data[block])
         self._terminated[block] = terminated
         self._trajectory[block] = self._current
         rows = np.arange(self.total, self.total + self.n_envs)
-        while self._current.max() >= len(self._last_row):
+        while self._n_trajectories > len(self._last_row):
             self._last_row = np.concatenate([self._last_row, np.full_like(self._last_row, -1)])
         self._last_row[self._current] = rows
-        n_done = int(np.count_nonzero(done))
-        if n_done:
+        if done.any():
+            n_done = int(np.count_nonzero(done))
             self._current[done] = np.arange(self._n_trajectories, self._n_trajectories + n_done)
             self._n_trajectories += n_done
         self.total += self.n_envs
@@ -97,7 +97,16 @@ class TransitionStore:
         :param rows: row numbers, none older than :attr:`oldest`
         :return: float32 array of shape ``(len(rows), dim)``
         """
-        return self._data[name][rows % self.capacity]
+        return self._data[rows % self.capacity, self._slices[name]]
+
+    def read(self, rows: np.ndarray) -> dict[str, np.ndarray]:
+        """Read all columns, at the cost of one.
+
+        :param rows: row numbers, none older than :attr:`oldest`
+        :return: by name what :meth:`column` returns
+        """
+        data = self._data[rows % self.capacity]
+        return {name: data[:, columns] for name, columns in self._slices.items()}
 
     def terminated(self, rows: np.ndarray) -> np.ndarray:
         """Tell after which rows the environment ended for good, shape ``(len(rows),)``."""
@@ -147,15 +156,16 @@ class TransitionStore:
                     "load it into an agent made with the same buffer_size and number of environments."
                 )
         for name in _COLUMNS:
-            if state["columns"][name].shape[1:] != self._data[name].shape[1:]:
+            own = self._data[:1, self._slices[name]].shape[1:]
+            if state["columns"][name].shape[1:] != own:
                 raise ValueError(
                     f"The stored replay buffer has {name} of shape {state['columns'][name].shape[1:]}, this agent's "
-                    f"environment gives {self._data[name].shape[1:]}."
+                    f"environment gives {own}."
                 )
         self.total = int(state["total"])
         at = np.arange(self.oldest, self.total) % self.capacity
         for name in _COLUMNS:
-            self._data[name][at] = state["columns"][name]
+            self._data[at, self._slices[name]] = state["columns"][name]
         self._terminated[at] = state["terminated"]
         self._trajectory[at] = state["trajectory"]
         self._current = np.array(state["current"])
@@ -273,15 +283,15 @@ class OptionReplay(ReplayBuffer):
             rows = np.concatenate([own_rows, rng.integers(store.oldest, store.total, size=batch_size - n_own)])
             imagined = np.ones(batch_size, dtype=bool)
             imagined[:n_own] = rng.random(n_own) < self.hindsight
-        goal = store.column("goal", rows)
-        next_achieved_goal = store.column("next_achieved_goal", rows)
+        data = store.read(rows)
+        goal, next_achieved_goal = data["goal"], data["next_achieved_goal"]
         later = store.future(rows[imagined], self.horizon, rng)
         goal[imagined] = store.column("next_achieved_goal", later)
         reached = self.rule.reached(next_achieved_goal, goal, imagined)
         return ReplayBufferSamples(
-            observations=self._tensor(self.view(store.column("observation", rows), store.column("achieved_goal", rows), goal)),
-            actions=self._tensor(store.column("action", rows)),
-            next_observations=self._tensor(self.view(store.column("next_observation", rows), next_achieved_goal, goal)),
+            observations=self._tensor(self.view(data["observation"], data["achieved_goal"], goal)),
+            actions=self._tensor(data["action"]),
+            next_observations=self._tensor(self.view(data["next_observation"], next_achieved_goal, goal)),
             dones=self._tensor((reached | store.terminated(rows)).astype(np.float32)[:, None]),
             rewards=self._tensor(self.rule.reward(reached)[:, None]),
         )

@@ -1,8 +1,20 @@
 """Where the agent has been, in goal space, and how long it took from one place to the next."""
 
-from typing import Any
+import math
+from typing import Any, NamedTuple
 
 import numpy as np
+
+
+class _Place(NamedTuple):
+    """Where an agent was found, in which event, and how far it can move before that must be looked at again."""
+
+    point: list[float]
+    event: int
+    slack: float
+
+
+_NOWHERE = _Place([], -1, 0.0)  # not looked at yet
 
 
 class VisitedStates:
@@ -37,6 +49,7 @@ class VisitedStates:
         self._centers = np.zeros((0, goal_dim), dtype=np.float64)
         self._radii = np.zeros(0, dtype=np.float64)
         self._passed: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None = None
+        self._places = [_NOWHERE] * n_envs
 
     @property
     def points(self) -> np.ndarray:
@@ -51,9 +64,11 @@ class VisitedStates:
         :param point: position in goal space, shape ``(goal_dim,)``
         :param done: whether the trajectory ends here
         """
-        moved = point - self._last_point[env_index]
-        if done or not float(moved @ moved) < self.spacing**2:  # NaN, before the first point, counts as moved
-            self._append(env_index, step, point)
+        coordinates = point.tolist()
+        label = self._locate(env_index, coordinates)
+        # NaN, before the first point, counts as moved.
+        if done or not math.dist(coordinates, self._last_point[env_index].tolist()) < self.spacing:
+            self._append(env_index, step, point, label)
         if done:
             self._cut(env_index)
 
@@ -64,6 +79,7 @@ class VisitedStates:
         """
         self._current = np.zeros(n_envs, dtype=np.int64)
         self._last_point = np.zeros((n_envs, self.goal_dim), dtype=np.float32)
+        self._places = [_NOWHERE] * n_envs
         for env_index in range(n_envs):
             self._cut(env_index)
 
@@ -72,18 +88,44 @@ class VisitedStates:
         self._n_trajectories += 1
         self._last_point[env_index] = np.nan
 
-    def _append(self, env_index: int, step: int, point: np.ndarray) -> None:
+    def event(self, env_index: int) -> int:
+        """Return the index of the event that the point recorded last for an environment lies in, ``-1`` for none."""
+        return self._places[env_index].event
+
+    def _locate(self, env_index: int, coordinates: list[float]) -> int:
+        place = self._places[env_index]
+        if math.dist(coordinates, place.point or coordinates) >= place.slack:
+            place = self._places[env_index] = self._place(coordinates)
+        return place.event
+
+    def _place(self, coordinates: list[float]) -> "_Place":
+        if len(self._radii) == 0:
+            return _Place(coordinates, -1, math.inf)
+        offsets = self._centers - coordinates
+        distances = np.sqrt(np.einsum("ij,ij->i", offsets, offsets))
+        outside = distances - self._radii
+        inside = outside <= 0.0
+        if not inside.any():
+            return _Place(coordinates, -1, float(outside.min()))
+        event = int(np.where(inside, distances, np.inf).argmin())
+        # Another event can become the nearest one after half of what it is further away.
+        rivals = 0.5 * (np.delete(distances, event) - distances[event])
+        return _Place(coordinates, event, min(float(-outside[event]), float(rivals.min(initial=np.inf))))
+
+    def _append(self, env_index: int, step: int, point: np.ndarray, label: int) -> None:
         if self.size >= self.capacity:
             self._forget_older_half()
         if self.size == len(self._step):
+            grown = max(1024, 2 * self.size)
             for name in ("_points", "_trajectory", "_step", "_label"):
                 array = getattr(self, name)
-                setattr(self, name, np.concatenate([array, np.zeros_like(array)]))
+                more = np.zeros((grown - self.size, *array.shape[1:]), dtype=array.dtype)
+                setattr(self, name, np.concatenate([array, more]))
         i = self.size
         self._points[i] = point
         self._trajectory[i] = self._current[env_index]
         self._step[i] = step
-        self._label[i] = self.label(np.asarray(point)[None])[0]
+        self._label[i] = label
         self._last_point[env_index] = point
         self.size += 1
         self._passed = None
@@ -107,6 +149,7 @@ class VisitedStates:
         self._radii = np.asarray(radii, dtype=np.float64)
         self._label[: self.size] = self.label(self.points)
         self._passed = None
+        self._places = [_NOWHERE] * len(self._current)
 
     def label(self, points: np.ndarray) -> np.ndarray:
         """Return the event each point lies in.
@@ -116,7 +159,7 @@ class VisitedStates:
         """
         best = np.full(len(points), -1, dtype=np.int32)
         nearest = np.full(len(points), np.inf)
-        if len(points) <= 8:  # one point against many events: the per-step path
+        if len(points) <= 8:  # few points against many events
             if len(self._radii) == 0:
                 return best
             offsets = np.asarray(points, dtype=np.float64)[:, None] - self._centers
@@ -296,7 +339,7 @@ class VisitedStates:
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Restore what :meth:`get_state` returned; the events must be set again afterwards."""
-        self._points = np.array(state["points"], dtype=np.float32)
+        self._points = np.array(state["points"], dtype=np.float32).reshape(-1, self.goal_dim)
         self._trajectory = np.array(state["trajectory"], dtype=np.int64)
         self._step = np.array(state["step"], dtype=np.int64)
         self.size = len(self._step)
@@ -305,8 +348,7 @@ class VisitedStates:
         self._last_point = np.array(state["last_point"], dtype=np.float32)
         self._n_trajectories, self.n_forgotten = int(state["n_trajectories"]), int(state["n_forgotten"])
         self._passed = None
-        if self.size == 0:
-            self.__init__(self.goal_dim, self.spacing, len(self._current), self.capacity)  # type: ignore[misc]
+        self._places = [_NOWHERE] * len(self._current)
 
 
 def _fewest(event: np.ndarray, steps: np.ndarray, indices: np.ndarray) -> dict[int, int]:

@@ -19,6 +19,7 @@ FLOORS: dict[str, float] = {
     "visited": 0,
     "saving": 0,
     "interrupts": 0,
+    "vec_env": 0,
     "paper": 0,  # plain arguments
     "envs": 0,
     "options": 1,

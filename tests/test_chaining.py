@@ -24,7 +24,7 @@ class Line(World):
     def succeed(self, option: Option, start: float, times: int = 1, *, own: bool = True) -> None:
         for _ in range(times):
             end = option.subgoal.copy()
-            assert option.terminates(end[None])[0]
+            assert option.terminates(end)
             path = np.linspace([start, 0.0], end, 15)[:-1]
             self.chaining.learn_success(option, path, end, own=own)
 
@@ -86,7 +86,7 @@ def test_a_child_leads_to_the_parents_pessimistic_set_when_the_source_is_outside
     assert child.termination is root
     assert not child.mature
     points = np.stack([np.linspace(-5, 15, 81), np.zeros(81)], axis=1)
-    np.testing.assert_array_equal(child.terminates(points), root.initiation.pessimistic(points))
+    assert [child.terminates(point) for point in points] == root.initiation.pessimistic(points).tolist()
     np.testing.assert_array_equal(child.subgoal, root.initiation.core)
     assert line.chaining.chain_of["o2"] is line.chain
 
@@ -165,7 +165,7 @@ def test_admissible_is_none_that_has_nothing_to_do(line: Line) -> None:
     line.succeed(line.option(0), 7.0, 3)
     root, child = line.option(0), line.option(1)
     inside_parent = root.subgoal if root.initiation.core is None else root.initiation.core
-    assert child.terminates(inside_parent[None])[0]
+    assert child.terminates(inside_parent)
     assert line.chaining.admissible(line.chain, inside_parent).id == "o1"
 
 

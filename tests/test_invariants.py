@@ -135,7 +135,7 @@ def check_starts(world: World) -> None:
         assert graph.startable(point) == startable
         for target in graph.events:
             path = world.planner.path_to(point, target)
-            useful = [id for id in startable if not graph.options[id].terminates(point[None])[0]]
+            useful = [id for id in startable if not graph.options[id].terminates(point)]
             assert graph.useful(point) == useful
             assert (path is not None) == any(nx.has_path(graph.nx, id, target) for id in useful)
             assert path is None or path.vertices[0] in useful
@@ -231,7 +231,7 @@ class History:
             center = termination.initiation.core if isinstance(termination, Option) else option.subgoal
             assert center is not None
             end = center + np.array([offset, 0.0])
-            if not option.terminates(end[None])[0]:
+            if not option.terminates(end):
                 end = center
             option.succeeded(np.stack([start, start]), end)
         else:

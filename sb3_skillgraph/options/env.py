@@ -85,7 +85,7 @@ class OptionEnv(gym.Wrapper):
         observation, _, terminated, truncated, info = self.env.step(action)
         self._steps += 1
         point = np.asarray(observation["achieved_goal"])
-        ended = fate(self.termination, point, self._steps, self.timeout)
+        ended = fate(self.termination.holds(point), self._steps, self.timeout)
         success = ended == Fate.SUCCEEDED
         self._last = None if terminated or truncated else observation
         info["is_success"] = success

@@ -2,10 +2,6 @@
 
 from enum import IntEnum
 
-import numpy as np
-
-from sb3_skillgraph.events import TerminationSet
-
 
 class Fate(IntEnum):
     """What has become of a running option."""
@@ -15,15 +11,14 @@ class Fate(IntEnum):
     TIMED_OUT = 2
 
 
-def fate(termination: TerminationSet, point: np.ndarray, steps: int, timeout: int) -> Fate:
+def fate(reached: bool, steps: int, timeout: int) -> Fate:
     """Tell whether a running option goes on.
 
-    :param termination: the set it ends in
-    :param point: where the agent stands, shape ``(goal_dim,)``
+    :param reached: whether the agent stands in the option's termination set
     :param steps: environment steps the option has run
     :param timeout: environment steps it may run
     :return: success takes precedence over a timeout on the same step
     """
-    if termination.contains(point[None])[0]:
+    if reached:
         return Fate.SUCCEEDED
     return Fate.TIMED_OUT if steps >= timeout else Fate.RUNNING

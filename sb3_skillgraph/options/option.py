@@ -77,10 +77,14 @@ class Option:
         """
         return self.initiation.pessimistic(points)
 
-    def terminates(self, points: np.ndarray) -> np.ndarray:
-        """Tell at which points the option has succeeded, bool array of shape ``(n,)``."""
+    def holds(self, point: np.ndarray) -> bool:
+        """Tell whether an option that leads here has succeeded at a point, shape ``(goal_dim,)``."""
+        return bool(self.initiation.pessimistic(point[None])[0])
+
+    def terminates(self, point: np.ndarray) -> bool:
+        """Tell whether the option has succeeded at a point, shape ``(goal_dim,)``."""
         assert self.termination is not None, "The global option ends where it is told to."
-        return self.termination.contains(points)
+        return self.termination.holds(point)
 
     @property
     def subgoal(self) -> np.ndarray:

@@ -94,9 +94,8 @@ class EventDiscovery:
 
         :param center: shape ``(goal_dim,)``
         """
-        point = np.asarray(center)[None]
-        in_event = any(bool(event.contains(point)[0]) for event in self.graph.events.values())
-        return in_event or bool(self.graph.startable(point[0]))
+        point = np.asarray(center)
+        return any(event.holds(point) for event in self.graph.events.values()) or bool(self.graph.startable(point))
 
     def add(self, center: np.ndarray) -> SalientEvent:
         """Add an event to the graph whatever is there.
