@@ -17,7 +17,7 @@ from stable_baselines3.td3.policies import MultiInputPolicy
 
 from sb3_skillgraph.assembly import Assembly
 from sb3_skillgraph.controller import GLOBAL, ControllerState, Request
-from sb3_skillgraph.goal_env import KEYS, GoalSpec, as_batch, as_goal, check_finite, refuse_vec_normalize, rows, with_terminal
+from sb3_skillgraph.goal_env import GoalSpec, as_batch, as_goal, check_finite, refuse_vec_normalize, rows, with_terminal
 from sb3_skillgraph.interrupts import Interrupts
 from sb3_skillgraph.options.learner import OptionDDPG
 from sb3_skillgraph.options.option import Option

@@ -99,7 +99,9 @@ class Assembly(Persistence):
 
     def _build_skills(self) -> None:
         args = self._arguments
-        self.graph = SkillGraph(args["containment"], args["rate_prior"], args["evidence_edges"], args["min_success_rate"])
+        self.graph = SkillGraph(
+            self._spec.goal_dim, args["containment"], args["rate_prior"], args["evidence_edges"], args["min_success_rate"]
+        )
         self.visited = VisitedStates(self._spec.goal_dim, 0.25 * self.event_radius, self.n_envs)
         self.planner = GraphPlanner(self.graph, self.visited, self.event_radius, args["event_reach"], args["nearest"])
         self.chaining = DeepSkillChaining(

@@ -145,8 +145,8 @@ class DeepSkillChaining:
     def _learned(self, option: Option, start: np.ndarray, success: bool) -> None:
         chain = self.chain_of[option.id]
         source = self.graph.events[chain.source]
-        for event in self.graph.events.values():
-            if event.id != option.target and event.holds(start):
+        for event in self.graph.event_bank.holding(start):
+            if event.id != option.target:
                 self.graph.ran_from(event, option, success)
         refitted = option.initiation.refit(force=not option.mature)
         if option.mature:

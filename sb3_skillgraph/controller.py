@@ -160,7 +160,9 @@ class Controller:
         :return: the state, undecided where an option ended; one outcome per option that ended
         """
         ended: list[tuple[int, Fate]] = []
-        for i, (index, aim, steps) in enumerate(zip(state.option.tolist(), state.aim.tolist(), state.steps.tolist(), strict=True)):
+        for i, (index, aim, steps) in enumerate(
+            zip(state.option.tolist(), state.aim.tolist(), state.steps.tolist(), strict=True)
+        ):
             if index == UNDECIDED:
                 continue
             timeout = self.timeout if index != GLOBAL else self.timeout // 2

@@ -4,7 +4,6 @@ import math
 from dataclasses import asdict, dataclass
 from typing import Any, Literal, NamedTuple
 
-import networkx as nx
 import numpy as np
 
 from sb3_skillgraph.chaining import DeepSkillChaining, SkillChain
@@ -265,7 +264,6 @@ class Curriculum:
     def _choose(self, point: np.ndarray) -> Mission:
         if self.pinned is not None:
             return self._to_event(point, self.graph.events[self.pinned])
-        connected = self.connected()
         if self.discovery.due(self.n_episodes, self.graph.events.keys() - self.chaining.unsettled()):
             for event in self.discovery.attempt(self.n_episodes, self.rng):
                 self._join(event)
@@ -274,8 +272,10 @@ class Curriculum:
         draw = self.rng.random()
         if draw < self.strategy.explore_prob:
             return self._explore()
-        if draw < self.strategy.explore_prob + self.strategy.practise_prob and len(connected) > 1:
-            return self._mission(self.graph.events[sorted(connected)[self.rng.integers(len(connected))]], None)
+        if draw < self.strategy.explore_prob + self.strategy.practise_prob:
+            connected = self.graph.reachable("e0")
+            if len(connected) > 1:
+                return self._mission(self.graph.events[connected[self.rng.integers(len(connected))]], None)
         chain = self._nearest_chain(point)
         return self._explore() if chain is None else self._mission(self.graph.events[chain.target], chain)
 
@@ -292,10 +292,6 @@ class Curriculum:
                 self._credit(chain, path, event.center)
         if self.strategy.target_choice == "nearest":
             self.chaining.open_chain(event, source)
-
-    def connected(self) -> set[str]:
-        """Return the ids of the events that a path leads to from the first."""
-        return {"e0"} | (nx.descendants(self.graph.nx, "e0") & self.graph.events.keys()) if self.graph.events else set()
 
     def _mission(self, event: SalientEvent, chain: SkillChain | None) -> Mission:
         return Mission(event.center, event.id, None if chain is None else chain.id)

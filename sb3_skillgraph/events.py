@@ -71,3 +71,63 @@ class SalientEvent:
     def get_state(self) -> dict[str, Any]:
         """Return the event as plain data."""
         return {"id": self.id, "center": self.center, "radius": self.radius}
+
+
+class EventBank:
+    """Many events together: one question for all of them.
+
+    :param goal_dim: dimension of goal space
+    """
+
+    def __init__(self, goal_dim: int) -> None:
+        self.events: list[SalientEvent] = []
+        self._index: dict[str, int] = {}
+        self._centers = np.zeros((16, goal_dim))
+        self._radii = np.zeros(16)
+        self._middle = np.zeros((16, goal_dim))
+
+    def add(self, event: SalientEvent) -> None:
+        """Take in a new event."""
+        i = self._index[event.id] = len(self.events)
+        self.events.append(event)
+        if i == len(self._radii):
+            for name in ("_centers", "_radii", "_middle"):
+                array = getattr(self, name)
+                setattr(self, name, np.concatenate([array, np.zeros_like(array)]))
+        self._centers[i], self._radii[i], self._middle[i] = event.center, event.radius, event.center
+
+    def triggered(self, event: SalientEvent, points: np.ndarray) -> None:
+        """Note where an event has been triggered lately.
+
+        :param event: a known event
+        :param points: shape ``(n, goal_dim)``
+        """
+        self._middle[self._index[event.id]] = np.median(points, axis=0)
+
+    def shares(self, points: np.ndarray) -> np.ndarray:
+        """Return which share of some points lies in each event.
+
+        :param points: shape ``(n, goal_dim)``
+        :return: shape ``(n_events,)``
+        """
+        n = len(self.events)
+        offsets = np.asarray(points, dtype=np.float64)[:, None] - self._centers[:n]
+        return (np.einsum("ijk,ijk->ij", offsets, offsets) <= self._radii[:n] ** 2).mean(axis=0)
+
+    def holding(self, point: np.ndarray) -> list[SalientEvent]:
+        """Return the events that a point lies in.
+
+        :param point: shape ``(goal_dim,)``
+        """
+        return [self.events[i] for i in np.flatnonzero(self.shares(point[None]))]
+
+    def triggered_in(self, lower: np.ndarray, upper: np.ndarray) -> list[SalientEvent]:
+        """Return the events the middle of whose trigger points lies in a box.
+
+        No other event can have more than half of them in there.
+
+        :param lower: lower corner of the box, shape ``(goal_dim,)``
+        :param upper: upper corner
+        """
+        middle = self._middle[: len(self.events)]
+        return [self.events[i] for i in np.flatnonzero(((middle >= lower) & (middle <= upper)).all(axis=1))]

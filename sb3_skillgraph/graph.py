@@ -1,18 +1,23 @@
 """The skill graph: a thin layer over one ``networkx.DiGraph`` (sections 3.1, 3.2.6, A.2)."""
 
+import functools
 import itertools
+import math
+import operator
 from collections import deque
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from typing import Any, NamedTuple
 
 import networkx as nx
 import numpy as np
 
-from sb3_skillgraph.events import SalientEvent
-from sb3_skillgraph.options.initiation import InitiationBank
+from sb3_skillgraph.events import EventBank, SalientEvent
+from sb3_skillgraph.options.bank import OptionBank
 from sb3_skillgraph.options.option import Option
+from sb3_skillgraph.routes import Routes, Tree
 
 TRIGGERS_LENGTH = 50
+CACHED_TREES = 64  # while nothing changes, many plans begin at the same options
 
 
 class GraphPath(NamedTuple):
@@ -40,6 +45,7 @@ class SkillGraph:
     *Lies in* means that at least a share ``containment`` of the recent samples do. Every edge carries ``weight`` and
     ``success_rate``; every vertex carries its ``item``.
 
+    :param goal_dim: dimension of goal space
     :param containment: share of samples that must lie inside; 1.0 is the paper's strict rule
     :param rate_prior: pseudo-counts of a success and a failure in every success rate; 0 is the paper's plain fraction
     :param evidence_edges: whether runs begun in an event and mostly successful put the event into the option's
@@ -49,12 +55,14 @@ class SkillGraph:
 
     def __init__(
         self,
+        goal_dim: int,
         containment: float = 0.9,
         rate_prior: float = 1.0,
         evidence_edges: bool = True,
         min_success_rate: float = 0.2,
     ) -> None:
         self.nx = nx.DiGraph()
+        self.goal_dim = goal_dim
         self.containment = containment
         self.rate_prior = rate_prior
         self.evidence_edges = evidence_edges
@@ -65,8 +73,9 @@ class SkillGraph:
         # (event, option) -> recent outcomes of the option's runs that began in the event
         self.evidence: dict[tuple[str, str], deque[bool]] = {}
         self.version = 0
-        self._bank: tuple[InitiationBank, tuple[str, ...]] | None = None
-        self._costs: dict[str, tuple[dict[str, float], dict[str, list[str]]]] = {}
+        self.event_bank, self.option_bank = EventBank(goal_dim), OptionBank(goal_dim)
+        self._routes = Routes()
+        self._trees: dict[tuple[Any, ...], Tree] = {}
 
     # -- vertices -----------------------------------------------------------------------------------------------------
 
@@ -77,6 +86,7 @@ class SkillGraph:
         """
         self._add_vertex(event.id, event)
         self.events[event.id] = event
+        self.event_bank.add(event)
         self.triggers[event.id] = deque([event.center], maxlen=TRIGGERS_LENGTH)
 
     def add_option(self, option: Option) -> None:
@@ -88,13 +98,13 @@ class SkillGraph:
             raise ValueError(f"Option {option.id!r} is still gestating; only mature options belong in the graph.")
         self._add_vertex(option.id, option)
         self.options[option.id] = option
-        self._bank = None
         self.refresh(option, refitted=True)
 
     def _add_vertex(self, id: str, item: SalientEvent | Option) -> None:
         if id in self.nx:
             raise ValueError(f"The graph already has a vertex {id!r}.")
         self.nx.add_node(id, item=item)
+        self._routes.add_vertex(id)
         self._changed()
 
     def remove_option(self, option: Option) -> None:
@@ -102,12 +112,26 @@ class SkillGraph:
         self.nx.remove_node(option.id)
         del self.options[option.id]
         self.evidence = {key: value for key, value in self.evidence.items() if key[1] != option.id}
-        self._bank = None
+        self._index()
         self._changed()
+
+    def _index(self) -> None:
+        """Build anew what answers questions fast."""
+        goal_dim = self.goal_dim
+        self.event_bank, self.option_bank, self._routes = EventBank(goal_dim), OptionBank(goal_dim), Routes()
+        for event in self.events.values():
+            self.event_bank.add(event)
+            self.event_bank.triggered(event, np.stack(self.triggers[event.id]))
+        for option in self.options.values():
+            self.option_bank.put(option)
+        for id in self.nx:
+            self._routes.add_vertex(id)
+        for source, target, weight in self.nx.edges(data="weight"):
+            self._routes.set_edge(source, target, weight)
 
     def _changed(self) -> None:
         self.version += 1
-        self._costs.clear()
+        self._trees.clear()
 
     # -- what runs teach ----------------------------------------------------------------------------------------------
 
@@ -117,11 +141,19 @@ class SkillGraph:
         :param event: the event
         :param point: shape ``(goal_dim,)``
         """
-        self.triggers[event.id].append(np.asarray(point, dtype=np.float64))
-        members, ids = self.bank()
-        inside = members.contains(np.stack(self.triggers[event.id])).mean(axis=0)
-        for share, option_id in zip(inside, ids, strict=True):
-            self._event_option_edge(event.id, option_id, float(share))
+        triggers = self.triggers[event.id]
+        triggers.append(np.asarray(point, dtype=np.float64))
+        points = np.stack(triggers)
+        self.event_bank.triggered(event, points)
+        shares = self._startable_shares(points)
+        for id in sorted({*shares, *self.nx.successors(event.id)}):
+            self._event_option_edge(event.id, id, shares.get(id, 0.0))
+
+    def _startable_shares(self, points: np.ndarray) -> dict[str, float]:
+        """Return by option from which share of some points it can start, where that suffices for an edge."""
+        indices, inside = self.option_bank.startable(points)
+        shares = zip(indices.tolist(), inside.mean(axis=0).tolist(), strict=True)
+        return {self.option_bank.options[i].id: share for i, share in shares if share >= self.containment}
 
     def ran_from(self, event: SalientEvent, option: Option, success: bool) -> None:
         """Remember the outcome of a run that began in an event.
@@ -143,8 +175,8 @@ class SkillGraph:
         :param option: a mature option of the graph
         :param refitted: whether its initiation set was fitted anew, so that the edges into it must be looked at too
         """
+        self.option_bank.put(option)
         if refitted:
-            self._bank = None
             self._edges_into(option)
         self._edges_out_of(option)
 
@@ -157,14 +189,11 @@ class SkillGraph:
             parent = self.options.get(option.target)
             if self.containment == 1.0 and parent is not None and not parent.initiation.optimistic(effects).all():
                 del rates[option.target]  # to the letter of the paper; else a chain keeps the edge it was built on
-            members, ids = self.bank()
-            for share, id in zip(members.contains(effects).mean(axis=0), ids, strict=True):
-                if share >= self.containment and id not in (option.id, option.target):
-                    rates[id] = rate * float(share)
-            for event in self.events.values():
-                share = float(event.contains(effects).mean())
-                if share >= self.containment and event.id != option.target:
-                    rates[event.id] = rate * share
+            shares = self._startable_shares(effects)
+            in_events = self.event_bank.shares(effects)
+            for i in np.flatnonzero(in_events >= self.containment):
+                shares[self.event_bank.events[i].id] = float(in_events[i])
+            rates.update((id, rate * share) for id, share in shares.items() if id not in (option.id, option.target))
         for id in [*self.nx.successors(option.id)]:
             if id not in rates:
                 self._set_edge(option.id, id, 0.0)
@@ -174,13 +203,24 @@ class SkillGraph:
 
     def _edges_into(self, option: Option) -> None:
         initiation = option.initiation
-        for event_id, points in self.triggers.items():
-            self._event_option_edge(event_id, option.id, float(initiation.optimistic(np.stack(points)).mean()))
-        for other in self.options.values():
-            if other.effects and other is not option and (other.target != option.id or self.containment == 1.0):
+        box = self._middles(*initiation.optimistic_boundaries[0].box())
+        events = {event.id for event in self.event_bank.triggered_in(*box)}
+        others = {other.id for other in self.option_bank.ending_in(*box)}
+        before = set(self.nx.predecessors(option.id))
+        for id in sorted(events | (before & self.events.keys())):
+            self._event_option_edge(id, option.id, float(initiation.optimistic(np.stack(self.triggers[id])).mean()))
+        for id in sorted((others | (before & self.options.keys())) - {option.id}):
+            other = self.options[id]
+            if other.effects and (other.target != option.id or self.containment == 1.0):
                 share = float(initiation.optimistic(np.stack(other.effects)).mean())
                 rate = other.success_rate(self.rate_prior) * share if share >= self.containment else 0.0
                 self._set_edge(other.id, option.id, rate)
+
+    def _middles(self, lower: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the box in which the middle of points lies that lie in a box, as far as an edge asks for."""
+        if self.containment > 0.5:
+            return lower, upper
+        return np.full_like(lower, -np.inf), np.full_like(upper, np.inf)
 
     def _event_option_edge(self, event_id: str, option_id: str, share: float) -> None:
         rate = share if share >= self.containment else 0.0
@@ -193,31 +233,25 @@ class SkillGraph:
         if rate <= 0.0 or rate < self.min_success_rate:
             if self.nx.has_edge(source, target):
                 self.nx.remove_edge(source, target)
+                self._routes.remove_edge(source, target)
                 self._changed()
             return
         weight = 1.0 / rate if weight is None else weight
-        if not self.nx.has_edge(source, target):
-            self.nx.add_edge(source, target, weight=weight, success_rate=rate, since=self.version)
-            self._changed()
-        elif self.nx.edges[source, target]["success_rate"] != rate:
-            self.nx.edges[source, target].update(weight=weight, success_rate=rate)
+        known = self.nx.get_edge_data(source, target)
+        if known is None or known["success_rate"] != rate:
+            self.nx.add_edge(source, target, weight=weight, success_rate=rate)
+            self._routes.set_edge(source, target, weight)
             self._changed()
 
     # -- questions ----------------------------------------------------------------------------------------------------
-
-    def bank(self) -> tuple[InitiationBank, tuple[str, ...]]:
-        """Return the optimistic initiation sets of all options in the graph, and the options' ids in its order."""
-        if self._bank is None:
-            self._bank = InitiationBank([o.initiation for o in self.options.values()]), tuple(self.options)
-        return self._bank
 
     def startable(self, point: np.ndarray) -> list[str]:
         """Return the ids of the options whose initiation set contains a point.
 
         :param point: shape ``(goal_dim,)``
         """
-        members, ids = self.bank()
-        return [ids[i] for i in np.flatnonzero(members.contains(np.asarray(point)[None])[0])]
+        indices, _ = self.option_bank.startable(np.asarray(point)[None])
+        return [self.option_bank.options[i].id for i in indices]
 
     def useful(self, point: np.ndarray) -> list[str]:
         """Return the ids of the options that can start at a point and do not end there at once.
@@ -226,58 +260,70 @@ class SkillGraph:
         """
         return [id for id in self.startable(point) if not self.options[id].terminates(np.asarray(point))]
 
-    def costs_to(self, target: str) -> dict[str, float]:
-        """Return the cost of the cheapest path from every vertex that has one to ``target`` (cached)."""
-        return self._tree(target)[0]
+    def ending_in(self, region: SalientEvent) -> list[Option]:
+        """Return the options whose effect set lies in a region."""
+        candidates = self.option_bank.ending_in(*self._middles(region.center - region.radius, region.center + region.radius))
+        return [o for o in candidates if region.contains(np.stack(o.effects)).mean() >= self.containment]
 
-    def _tree(self, target: str) -> tuple[dict[str, float], dict[str, list[str]]]:
-        if target not in self._costs:
-            reverse = self.nx.reverse(copy=False)
-            self._costs[target] = nx.single_source_dijkstra(reverse, target, weight="weight")
-        return self._costs[target]
+    def ways_from(self, sources: Sequence[str], avoid: Collection[str] = ()) -> Tree:
+        """Return the cheapest ways from any of some vertices to all others (cached until the graph changes).
 
-    def shortest_path(self, sources: Iterable[str], target: str) -> GraphPath | None:
+        :param sources: ids of vertices
+        :param avoid: ids of vertices that no way may lead through
+        """
+        key = (tuple(sources), tuple(avoid))
+        return self._tree(key, lambda: self._routes.ways_from(sources, avoid))
+
+    def ways_to(self, target: str) -> Tree:
+        """Return the cheapest ways from all vertices to one (cached until the graph changes)."""
+        return self._tree((target,), lambda: self._routes.ways_to(target))
+
+    def _tree(self, key: tuple[Any, ...], grow: Callable[[], Tree]) -> Tree:
+        if key not in self._trees:
+            if len(self._trees) >= CACHED_TREES:
+                self._trees.clear()
+            self._trees[key] = grow()
+        return self._trees[key]
+
+    def shortest_path(self, sources: Sequence[str], target: str) -> GraphPath | None:
         """Find the cheapest path from any of some vertices to another (section 3.2.4).
 
         :param sources: ids of vertices
         :param target: id of a vertex
         :return: the path, source and target included; None if there is none
         """
-        if target not in self.nx:
-            return None
-        costs, paths = self._tree(target)
-        reachable = [source for source in sources if source in costs]
-        if not reachable:
-            return None
-        best = min(reachable, key=lambda source: (costs[source], len(paths[source])))
-        vertices = tuple(reversed(paths[best]))
-        return GraphPath(vertices, float(costs[best]), self.success_probability(vertices))
+        return self.path_on(self.ways_from(sources), target)
 
-    def paths_from(self, sources: Sequence[str], avoid: Collection[str] = ()) -> tuple[dict[str, float], dict[str, list[str]]]:
-        """Return cost and path of the cheapest way from any of some vertices to every vertex that has one.
-
-        :param sources: ids of vertices
-        :param avoid: ids of vertices that no way may lead through
-        """
-        sources = [id for id in dict.fromkeys(sources) if id not in avoid]
-        if not sources:
-            return {}, {}
-        graph = nx.restricted_view(self.nx, [id for id in avoid if id in self.nx], []) if avoid else self.nx
-        costs, paths = nx.multi_source_dijkstra(graph, sources, weight="weight")
-        return costs, paths
+    def path_on(self, tree: Tree, target: str) -> GraphPath | None:
+        """Return the path to a vertex on a tree of :meth:`ways_from`; None if there is none."""
+        if target not in tree:
+            return None
+        vertices = tuple(tree.path(target))
+        return GraphPath(vertices, tree.cost(target), self.success_probability(vertices))
 
     def success_probability(self, vertices: Sequence[str]) -> float:
         """Return the product of the success rates along a path."""
-        rates = [self.nx.edges[edge]["success_rate"] for edge in itertools.pairwise(vertices)]
-        return float(np.prod(rates))
+        return math.prod(self.nx.edges[edge]["success_rate"] for edge in itertools.pairwise(vertices))
+
+    def reachable(self, source: str) -> list[str]:
+        """Return the ids of the events that a path leads to from a vertex, itself included if it is one."""
+        tree = self.ways_from([source])
+        return [id for id in self.events if id in tree]
 
     def joined_pairs(self) -> float:
         """Return the share of ordered pairs of events that are joined by a path (0 with fewer than two events)."""
         n = len(self.events)
         if n < 2:
             return 0.0
-        joined = sum(len(nx.descendants(self.nx, event) & self.events.keys()) for event in self.events)
-        return joined / (n * (n - 1))
+        components = nx.condensation(self.nx)
+        bit = {id: 1 << i for i, id in enumerate(self.events)}
+        # The events that can be reached from each strongly connected component, as bits of an integer.
+        reached: dict[int, int] = {}
+        for component in reversed(list(nx.topological_sort(components))):
+            own = sum(bit.get(id, 0) for id in components.nodes[component]["members"])
+            reached[component] = functools.reduce(operator.or_, (reached[c] for c in components.successors(component)), own)
+        of = components.graph["mapping"]
+        return sum(reached[of[event]].bit_count() - 1 for event in self.events) / (n * (n - 1))
 
     # -- saving -------------------------------------------------------------------------------------------------------
 
@@ -288,8 +334,7 @@ class SkillGraph:
             "options": list(self.options),
             "nodes": list(self.nx.nodes),
             "version": self.version,
-            # In the order of their making: ties between equally cheap paths then fall as before.
-            "edges": sorted(([u, v, d] for u, v, d in self.nx.edges(data=True)), key=lambda edge: edge[2]["since"]),
+            "edges": [[u, v, d] for u, v, d in self.nx.edges(data=True)],
             "triggers": {id: list(points) for id, points in self.triggers.items()},
             "evidence": [[event, option, list(record)] for (event, option), record in self.evidence.items()],
         }
@@ -310,5 +355,5 @@ class SkillGraph:
         self.triggers = {id: deque(points, maxlen=TRIGGERS_LENGTH) for id, points in state["triggers"].items()}
         self.evidence = {(event, option): deque(r, maxlen=10) for event, option, r in state["evidence"]}
         self.version = state["version"]
-        self._bank = None
-        self._costs.clear()
+        self._index()
+        self._trees.clear()

@@ -1,6 +1,6 @@
 """Planning over the skill graph: to an event, and to a goal the agent never saw (sections 3.2.3, 3.2.4, 3.3)."""
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -78,14 +78,8 @@ class GraphPlanner:
         :param avoid: ids of options that have failed lately; they are run only if nothing else leads there
         """
         useful = self.graph.useful(point)
-        if avoid:
-            costs, paths = self.graph.paths_from(useful, avoid)
-            if vertex in costs:
-                return self._path(paths[vertex], costs[vertex])
-        return self.graph.shortest_path(useful, vertex)
-
-    def _path(self, vertices: Sequence[str], cost: float) -> GraphPath:
-        return GraphPath(tuple(vertices), cost, self.graph.success_probability(vertices))
+        detour = self.graph.path_on(self.graph.ways_from(useful, avoid), vertex) if avoid else None
+        return detour or self.graph.shortest_path(useful, vertex)
 
     def vertices_near(self, goal: np.ndarray) -> list[tuple[SalientEvent, float]]:
         """Rank the events from which a goal is near, nearest first (section 3.2.3).
@@ -120,12 +114,11 @@ class GraphPlanner:
         if np.isfinite(steps) and self.nearest == "steps":
             # Beyond the reach of one option, plans are surer than a long way retraced.
             legs.append(Leg(None, None, steps / self.reach * (1.0 if steps <= self.reach else RETRACING)))
-        costs, paths = self.graph.paths_from(self.graph.useful(point), avoid)
+        tree = self.graph.ways_from(self.graph.useful(point), avoid)
         for event, distance in self.vertices_near(goal):
             if event.holds(point):
                 legs.append(Leg(None, None, distance / unit))
-            elif event.id in costs:
-                path = self._path(paths[event.id], costs[event.id])
+            elif (path := self.graph.path_on(tree, event.id)) is not None:
                 legs.append(Leg(event.id, path, path.cost + distance / unit))
         return sorted(legs, key=lambda leg: leg.cost)
 
@@ -154,9 +147,9 @@ class GraphPlanner:
         :param target: id of the vertex to be reached from there; None for any
         :return: the event reached soonest of those from which a path leads on; None if there is none
         """
-        costs = self.graph.costs_to(target) if target is not None else dict.fromkeys(self.graph.events, 0.0)
+        ways = self.graph.events if target is None else self.graph.ways_to(target)
         for event, _ in self._ranked(point, self.visited.events_after, self.visited.events_before):
-            if event.id in costs and not event.holds(point):
+            if event.id in ways and not event.holds(point):
                 return event
         return None
 
@@ -167,10 +160,7 @@ class GraphPlanner:
         :param radius: radius of the goal region, in goal units
         """
         region = SalientEvent("goal", goal, radius)
-        if any(region.holds(event.center) for event in self.graph.events.values()) or any(
-            option.effects and region.contains(np.stack(option.effects)).mean() >= self.graph.containment
-            for option in self.graph.options.values()
-        ):
+        if self.graph.ending_in(region) or any(region.holds(event.center) for event in self.graph.events.values()):
             return "in_graph"
         return "in_initiation_set" if self.graph.startable(goal) else "outside"
 
@@ -199,5 +189,5 @@ class GraphPlanner:
         if self.visited.size == 0:
             return 0.0
         points = self.visited.points[np.linspace(0, self.visited.size - 1, n_samples).astype(int)]
-        members, _ = self.graph.bank()
-        return float(((self.visited.label(points) >= 0) | members.contains(points).any(axis=1)).mean())
+        _, startable = self.graph.option_bank.startable(points)
+        return float(((self.visited.label(points) >= 0) | startable.any(axis=1)).mean())

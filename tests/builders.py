@@ -123,7 +123,7 @@ class World:
     """A graph with all that plans and acts on it, to be filled by hand. Goal space is the plane, the radius 1."""
 
     def __init__(self, *, reach: int = 20, nearest: Any = "steps", timeout: int = 10, **graph_kwargs: Any) -> None:
-        self.graph = SkillGraph(**graph_kwargs)
+        self.graph = SkillGraph(2, **graph_kwargs)
         self.visited = VisitedStates(2, 0.25)
         self.planner = GraphPlanner(self.graph, self.visited, 1.0, reach, nearest)
         self.made: list[Option] = []

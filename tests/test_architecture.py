@@ -23,6 +23,7 @@ FLOORS: dict[str, float] = {
     "paper": 0,  # plain arguments
     "envs": 0,
     "options": 1,
+    "routes": 1,
     "graph": 2,
     "goal_env": 2,
     "chaining": 3,

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from sklearn.svm import SVC, OneClassSVM
 
-from sb3_skillgraph.options.initiation import N_FAILURES, N_SUCCESSES, POINTS_PER_SUCCESS, InitiationBank, InitiationSet
+from sb3_skillgraph.options.initiation import N_FAILURES, N_SUCCESSES, POINTS_PER_SUCCESS, InitiationSet
 
 RADIUS = 1.0
 
@@ -73,26 +73,6 @@ def test_numpy_evaluation_equals_scikit_learns() -> None:
     assert 0.05 < expected.mean() < 0.95
     np.testing.assert_array_equal(initiation.optimistic(points)[clear], expected[clear])
     np.testing.assert_array_equal(initiation.pessimistic(points)[clear], (expected & (core_decision > 0))[clear])
-
-
-def test_the_bank_answers_as_each_set_would() -> None:
-    shifted = InitiationSet(RADIUS)
-    shifted.add_success(path([5.0, 5.0], [6.0, 3.0]))
-    shifted.refit(force=True)
-    plain = corridor()
-    plain.refit(force=True)
-    sets = [with_failures(), plain, shifted, with_failures()]
-    points = grid()
-    answers = InitiationBank(sets).contains(points)
-    assert answers.shape == (len(points), 4)
-    for column, initiation in zip(answers.T, sets, strict=True):
-        assert 0 < column.sum() < len(points)
-        np.testing.assert_array_equal(column, initiation.optimistic(points))
-    np.testing.assert_array_equal(InitiationBank(sets).contains(points[:1].astype(np.float32)), answers[:1])
-
-
-def test_an_empty_bank_contains_nothing() -> None:
-    assert InitiationBank([]).contains(grid()).shape == (1600, 0)
 
 
 @given(

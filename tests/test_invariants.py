@@ -95,9 +95,10 @@ def check_regions(graph: SkillGraph, options: Iterable[Option]) -> None:
         for id, points in option.initiation.regions.items():
             np.testing.assert_array_equal(points, graph.events[id].outline())
     points = np.stack([np.linspace(-3.0, 13.0, 9), np.zeros(9)], axis=1)
-    members, ids = graph.bank()
-    for column, id in zip(members.contains(points).T, ids, strict=True):
-        np.testing.assert_array_equal(column, graph.options[id].initiation.optimistic(points), err_msg=id)
+    indices, inside = graph.option_bank.startable(points)
+    by_id = {graph.option_bank.options[i].id: column for i, column in zip(indices, inside.T, strict=True)}
+    for id, option in graph.options.items():
+        np.testing.assert_array_equal(by_id.get(id, np.zeros(9, dtype=bool)), option.initiation.optimistic(points), err_msg=id)
 
 
 def check_paths(graph: SkillGraph) -> None:
@@ -116,14 +117,20 @@ def check_paths(graph: SkillGraph) -> None:
             assert math.isclose(path.cost, costs[source])
             assert math.isclose(path.success_probability, math.prod(edge["success_rate"] for edge in edges))
     for sources in (list(graph.nx)[:1], list(graph.options)[:3], []):
-        costs, paths = graph.paths_from(sources)
-        best = {target: graph.shortest_path(sources, target) for target in graph.nx}
-        assert set(costs) == set(paths) == {target for target, path in best.items() if path is not None}
-        for target, path in best.items():
+        tree = graph.ways_from(sources)
+        for target in graph.nx:
+            path = graph.shortest_path(sources, target)
+            assert (target in tree) == (path is not None)
             if path is not None:
-                assert math.isclose(costs[target], path.cost)
-                assert paths[target][0] in sources
-                assert paths[target][-1] == target
+                assert math.isclose(tree.cost(target), path.cost)
+                assert tree.path(target)[0] in sources
+                assert tree.path(target)[-1] == target
+        back = [graph.ways_to(target) for target in sources]
+        for source in graph.nx:
+            for target, tree_to in zip(sources, back, strict=True):
+                path = graph.shortest_path([source], target)
+                assert (source in tree_to) == (path is not None)
+                assert path is None or math.isclose(tree_to.cost(source), path.cost)
 
 
 def check_starts(world: World) -> None:
@@ -278,7 +285,7 @@ def test_a_restored_graph_is_the_same_graph(
         history.apply(*operation)
         twin.apply(*operation)
     graph = twin.graph
-    restored = SkillGraph(graph.containment, graph.rate_prior, graph.evidence_edges, graph.min_success_rate)
+    restored = SkillGraph(2, graph.containment, graph.rate_prior, graph.evidence_edges, graph.min_success_rate)
     restored.set_state(copy.deepcopy(graph.get_state()), graph.options)
     twin.world.graph = twin.graph = twin.world.planner.graph = restored
     for operation in [None, *after]:
@@ -287,8 +294,7 @@ def test_a_restored_graph_is_the_same_graph(
             twin.apply(*operation)
         one, other = history.graph, twin.graph
         assert list(one.nx) == list(other.nx)
-        assert [list(one.nx.succ[v].items()) for v in one.nx] == [list(other.nx.succ[v].items()) for v in other.nx]
-        assert [list(one.nx.pred[v]) for v in one.nx] == [list(other.nx.pred[v]) for v in other.nx]
+        assert {v: dict(one.nx.succ[v]) for v in one.nx} == {v: dict(other.nx.succ[v]) for v in other.nx}
         for x in (-1.0, 2.0, 5.0):
             for target in one.events:
                 point = np.array([x, 0.0])
@@ -337,7 +343,7 @@ def test_chains_keep_the_graph_in_order(mode: str, sequence: list[tuple[int, int
 
 
 def test_events_do_not_lead_to_events() -> None:
-    graph = SkillGraph()
+    graph = SkillGraph(2)
     for k in range(3):
         graph.add_event(event(k, 0.5 * k, 0.0))
     assert graph.nx.number_of_edges() == 0

@@ -39,6 +39,7 @@ def test_a_region_that_holds_an_options_effects_is_in_the_graph() -> None:
     option = world.add_option(target, (0.0, 0.0), successes=0)
     for _ in range(10):
         option.succeeded(np.zeros((2, 2)), at(10.9))
+    world.graph.refresh(option, refitted=False)
     assert world.planner.status(at(11.5), 1.0) == "in_graph"  # the event's centre lies outside the region
     assert world.planner.status(at(12.5), 1.0) == "outside"
     option.succeeded(np.zeros((2, 2)), at(9.5))

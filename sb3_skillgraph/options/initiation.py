@@ -1,11 +1,9 @@
 """Initiation sets: where an option can start, learned from where it succeeded and failed (sections 2.1, 2.2).
 
-scikit-learn fits the support vector machines, NumPy evaluates them: a membership question costs microseconds, and the
-same question can be put to many sets in one batch.
+scikit-learn fits the support vector machines, NumPy evaluates them: a membership question costs microseconds.
 """
 
 from collections import deque
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -38,6 +36,15 @@ class Boundary(NamedTuple):
             + np.einsum("ij,ij->i", self.support, self.support)
         )
         return np.exp(-self.gamma * squared) @ self.weights + self.intercept > 0.0
+
+    def box(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the corners of a box outside which no point lies inside, each of shape ``(goal_dim,)``.
+
+        Every point inside has a support vector near enough for all weights together to reach the threshold with it.
+        """
+        total, threshold = float(self.weights[self.weights > 0].sum()), -self.intercept
+        reach = np.inf if threshold <= 0.0 else np.sqrt(max(np.log(total / threshold), 0.0) / self.gamma)
+        return self.support.min(axis=0) - reach, self.support.max(axis=0) + reach
 
 
 class InitiationSet:
@@ -180,42 +187,6 @@ class InitiationSet:
         self.pessimistic_boundaries = [Boundary(**boundary) for boundary in state["pessimistic"]]
         self.core = state["core"]
         self._n_news = state["n_news"]
-
-
-class InitiationBank:
-    """The optimistic sets of many options, asked together: one batched query instead of one per option.
-
-    :param sets: fitted initiation sets
-    """
-
-    def __init__(self, sets: Sequence[InitiationSet]) -> None:
-        boundaries = [boundary for initiation in sets for boundary in initiation.optimistic_boundaries]
-        self.n_sets = len(sets)
-        if not boundaries:
-            return
-        self._support = np.concatenate([b.support for b in boundaries])
-        self._norms = np.einsum("ij,ij->i", self._support, self._support)
-        self._weights = np.concatenate([b.weights for b in boundaries])
-        self._gamma = np.concatenate([np.full(len(b.support), b.gamma) for b in boundaries])
-        self._intercepts = np.array([b.intercept for b in boundaries])
-        self._starts = np.cumsum([0] + [len(b.support) for b in boundaries[:-1]])
-        self._set_starts = np.cumsum([0] + [len(s.optimistic_boundaries) for s in sets[:-1]])
-
-    def contains(self, points: np.ndarray) -> np.ndarray:
-        """Tell for every point which sets contain it.
-
-        :param points: shape ``(n, goal_dim)``
-        :return: bool array of shape ``(n, n_sets)``
-        """
-        if self.n_sets == 0:
-            return np.zeros((len(points), 0), dtype=bool)
-        points = np.asarray(points, dtype=np.float64)
-        squared = np.einsum("ij,ij->i", points, points)[:, None] - 2.0 * points @ self._support.T + self._norms
-        squared *= -self._gamma
-        np.exp(squared, out=squared)
-        squared *= self._weights
-        decisions = np.add.reduceat(squared, self._starts, axis=1) + self._intercepts
-        return np.logical_and.reduceat(decisions > 0.0, self._set_starts, axis=1)
 
 
 def _one_class(points: np.ndarray, nu: float, gamma: float) -> Boundary:

@@ -115,12 +115,12 @@ def _draw_visited(axes: Axes, agent: SkillGraphAgent) -> None:
 
 def _draw_regions(axes: Axes, agent: SkillGraphAgent) -> None:
     """Shade the union of the optimistic initiation sets, darker where more options can start."""
-    bank, ids = agent.graph.bank()
-    if not ids:
+    bank = agent.graph.option_bank
+    if not bank.options:
         return
     if len(agent.events[0].center) != 2:
         points = agent.visited.points
-        startable = figures.project(points[bank.contains(points).any(axis=1)])
+        startable = figures.project(points[bank.startable(points)[1].any(axis=1)])
         axes.plot(*startable.T, "s", color=figures.REGION, markersize=4, alpha=0.5, zorder=figures.Z_REGION)
         return
     left, right = axes.get_xlim()
@@ -128,7 +128,7 @@ def _draw_regions(axes: Axes, agent: SkillGraphAgent) -> None:
     step = max(right - left, top - bottom) / _GRID
     x, y = np.arange(left + step / 2, right, step), np.arange(bottom + step / 2, top, step)
     grid = np.stack(np.meshgrid(x, y), axis=-1)
-    n_startable = np.stack([bank.contains(row).sum(axis=1) for row in grid])
+    n_startable = np.stack([bank.startable(row)[1].sum(axis=1) for row in grid])
     image = np.empty((*n_startable.shape, 4))
     image[..., :3] = to_rgb(figures.REGION)
     image[..., 3] = np.where(n_startable > 0, 0.3 + 0.6 * n_startable / n_startable.max(), 0.0)

@@ -95,7 +95,7 @@ class EventDiscovery:
         :param center: shape ``(goal_dim,)``
         """
         point = np.asarray(center)
-        return any(event.holds(point) for event in self.graph.events.values()) or bool(self.graph.startable(point))
+        return bool(self.graph.event_bank.holding(point) or self.graph.startable(point))
 
     def add(self, center: np.ndarray) -> SalientEvent:
         """Add an event to the graph whatever is there.
