@@ -3,7 +3,8 @@ What one gradient step costs: ``OptionDDPG`` and ``OptionTD3`` against SB3's DDP
 
 Both learn in one process on one thread and take turns, so that what else the machine does hits both alike; medians
 are over the turns. Beside them the time that the update's matrix products alone take, each by the fastest library
-at hand: no update without other arithmetic can be faster.
+at hand: no update without other arithmetic can be faster. On a GPU (``--device cuda``) there is no such column: there
+an update costs what it takes to start its kernels.
 
 Run it with ``OMP_NUM_THREADS=1 python -m benchmarks.update --out benchmarks/results/update.json``.
 """
@@ -12,6 +13,7 @@ import argparse
 import dataclasses
 import itertools
 import json
+import platform
 import statistics
 import time
 from collections.abc import Callable
@@ -58,19 +60,21 @@ CASES = [
     *(Case("DDPG", (256, 256), batch, "point") for batch in (64, 256)),
     *(Case("TD3", (256, 256), batch, "point") for batch in (64, 256)),
 ]
+CUDA_CASES = [Case(algorithm, (400, 300), 256, shape, 1.5) for algorithm in ("DDPG", "TD3") for shape in SHAPES]
 
 
-def build(cls: type[TD3], case: Case) -> TD3:
+def build(cls: type[TD3], case: Case, device: str = "cpu") -> TD3:
     """
     :param cls: DDPG or TD3, SB3's or ours
     :param case: what to build it for
+    :param device: torch device
     :return: a model without an environment, its buffer full of noise
     """
     n_obs, n_actions = SHAPES[case.shape]
     policy_kwargs = {"net_arch": list(case.net_arch)}
     # SB3 takes None for an environment and says otherwise.
     no_env: Any = None
-    model = cls("MlpPolicy", no_env, policy_kwargs=policy_kwargs, buffer_size=10_000, device="cpu", _init_setup_model=False)
+    model = cls("MlpPolicy", no_env, policy_kwargs=policy_kwargs, buffer_size=10_000, device=device, _init_setup_model=False)
     model.observation_space = spaces.Box(-np.inf, np.inf, (n_obs,), np.float32)
     model.action_space = spaces.Box(-1, 1, (n_actions,), np.float32)
     model.n_envs = 1
@@ -152,29 +156,25 @@ def timed(function: Callable[[], object], repeats: int) -> list[float]:
     return seconds
 
 
-def measure(case: Case, repeats: int) -> dict[str, float]:
+def measure(case: Case, repeats: int, device: str) -> dict[str, float]:
     """
     :param case: what to measure
     :param repeats: number of turns
-    :return: milliseconds of ``sb3``, ``ours`` and ``gemm``, the ratios ``speedup`` (median over turns of SB3's time
-        over ours), ``over_gemm`` and ``ceiling`` (SB3's time over that of the products)
+    :param device: torch device
+    :return: milliseconds of ``sb3`` and ``ours`` and their ratio ``speedup`` (the median over turns); on a CPU
+        ``gemm`` too, and the ratios ``over_gemm`` and ``ceiling`` (SB3's time over that of the products)
     """
     classes: dict[str, tuple[type[TD3], type[TD3]]] = {"DDPG": (DDPG, OptionDDPG), "TD3": (TD3, OptionTD3)}
     stock_class, our_class = classes[case.algorithm]
-    stock, ours = build(stock_class, case), build(our_class, case)
+    stock, ours = build(stock_class, case, device), build(our_class, case, device)
     # An even number of updates a turn, for TD3 to teach its actor in half of them.
     turns = [[timed_updates(model, case.batch_size) for model in (stock, ours)] for _ in range(repeats + 3)][3:]
-    gemm = [sum(times * fastest_product(shape, 20) for times, shape in products(case)) for _ in range(3)]
     sb3_ms, ours_ms = (1e3 * statistics.median(column) for column in zip(*turns, strict=True))
-    gemm_ms = 1e3 * min(gemm)
-    return {
-        "sb3": sb3_ms,
-        "ours": ours_ms,
-        "gemm": gemm_ms,
-        "speedup": statistics.median(a / b for a, b in turns),
-        "over_gemm": ours_ms / gemm_ms,
-        "ceiling": sb3_ms / gemm_ms,
-    }
+    row = {"sb3": sb3_ms, "ours": ours_ms, "speedup": statistics.median(a / b for a, b in turns)}
+    if device == "cpu":
+        gemm_ms = 1e3 * min(sum(times * fastest_product(shape, 20) for times, shape in products(case)) for _ in range(3))
+        row |= {"gemm": gemm_ms, "over_gemm": ours_ms / gemm_ms, "ceiling": sb3_ms / gemm_ms}
+    return row
 
 
 def timed_updates(model: TD3, batch_size: int) -> float:
@@ -208,23 +208,32 @@ def main() -> None:
     """Print the table, and write it where ``--out`` says."""
     parser = argparse.ArgumentParser(description="Time one gradient step against SB3's.")
     parser.add_argument("--repeats", type=int, default=100, help="turns of each model (two updates a turn)")
+    parser.add_argument("--device", choices=["cpu", "cuda"], default="cpu", help="where the networks are")
     parser.add_argument("--out", type=Path, help="JSON file for the results")
     arguments = parser.parse_args()
     th.set_num_threads(1)
+    on_cpu = arguments.device == "cpu"
     results = []
-    print(f"{'case':<32}{'SB3 ms':>8}{'ours ms':>9}{'GEMM ms':>9}{'speedup':>9}{'/GEMM':>7}{'ceiling':>9}")
-    for case in CASES:
-        row = measure(case, arguments.repeats)
+    print(
+        f"{'case':<32}{'SB3 ms':>8}{'ours ms':>9}{'speedup':>9}"
+        + (f"{'GEMM ms':>9}{'/GEMM':>7}{'ceiling':>9}" if on_cpu else "")
+    )
+    for case in CASES if on_cpu else CUDA_CASES:
+        row = measure(case, arguments.repeats, arguments.device)
         name = f"{case.algorithm} {'-'.join(map(str, case.net_arch))} B={case.batch_size} {case.shape}"
-        times = f"{row['sb3']:8.2f}{row['ours']:9.2f}{row['gemm']:9.2f}"
-        ratios = f"{row['speedup']:9.2f}{row['over_gemm']:7.2f}{row['ceiling']:9.2f}"
-        print(f"{name:<32}{times}{ratios}  {verdict(case, row)}", flush=True)
+        columns = f"{row['sb3']:8.2f}{row['ours']:9.2f}{row['speedup']:9.2f}"
+        if on_cpu:
+            columns += f"{row['gemm']:9.2f}{row['over_gemm']:7.2f}{row['ceiling']:9.2f}"
+        print(f"{name:<32}{columns}  {verdict(case, row)}", flush=True)
         results.append({**dataclasses.asdict(case), **row})
-    ddpg = statistics.median(row["speedup"] for row in results if row["min_speedup"] == 2.0)
-    print(f"median speedup of DDPG 400-300: {ddpg:.2f} (asked: 2.2)")
+    if on_cpu:
+        ddpg = statistics.median(row["speedup"] for row in results if row["min_speedup"] == 2.0)
+        print(f"median speedup of DDPG 400-300: {ddpg:.2f} (asked: 2.2)")
     if arguments.out is not None:
         arguments.out.parent.mkdir(parents=True, exist_ok=True)
-        arguments.out.write_text(json.dumps({"torch": th.__version__, "cases": results}, indent=1) + "\n")
+        device = platform.processor() or platform.machine() if on_cpu else th.cuda.get_device_name()
+        report = {"torch": th.__version__, "device": device, "cases": results}
+        arguments.out.write_text(json.dumps(report, indent=1) + "\n")
 
 
 if __name__ == "__main__":

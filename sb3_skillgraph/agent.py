@@ -314,7 +314,7 @@ class SkillGraphAgent(Assembly):
             if hold_left[i] > 0:
                 scaled[i] = held[i]
                 hold_left[i] -= 1
-        return scaled.clip(-1.0, 1.0).astype(np.float32), held, hold_left
+        return np.minimum(np.maximum(scaled, -1.0), 1.0).astype(np.float32), held, hold_left
 
     def _store_transition(
         self,
@@ -353,7 +353,9 @@ class SkillGraphAgent(Assembly):
         step = self._pending
         assert step is not None
         before, points = step.observation["achieved_goal"], rows(reached, "achieved_goal")
-        truncated = np.array([info.get("TimeLimit.truncated", False) for info in infos])
+        terminated = dones
+        if dones.any():
+            terminated = dones & ~np.array([info.get("TimeLimit.truncated", False) for info in infos])
         row = self.store.add(
             step.observation["observation"],
             before,
@@ -361,7 +363,7 @@ class SkillGraphAgent(Assembly):
             points,
             step.action,
             step.aims,
-            dones & ~truncated,
+            terminated,
             dones,
         )
         self._held_actions, self._hold_left = step.held_actions, step.hold_left
@@ -369,7 +371,7 @@ class SkillGraphAgent(Assembly):
         by_env = {outcome.env: outcome for outcome in outcomes}
         options = step.state.option.tolist()
         self._executed = sorted(set(options))
-        over = np.zeros(self.n_envs, dtype=bool)
+        over = [False] * self.n_envs
         for i, (index, done) in enumerate(zip(options, dones.tolist(), strict=True)):
             if index != GLOBAL:
                 self.controller.option(index).replay.add_rows(row[i : i + 1])
@@ -377,8 +379,8 @@ class SkillGraphAgent(Assembly):
             over[i] = self.curriculum.observe(i, before[i], points[i], by_env.get(i), done)
             if done:
                 self._hold_left[i] = 0
-        if over.any():
-            self._state = self._state.begun_anew(over)
+        if any(over):
+            self._state = self._state.begun_anew(np.array(over))
 
     def train(self, gradient_steps: int, batch_size: int = 100) -> None:
         """

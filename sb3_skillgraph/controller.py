@@ -208,7 +208,7 @@ class Controller:
             ``(n_envs, goal_dim)``; the state after the step
         """
         points = observation["achieved_goal"]
-        undecided = np.flatnonzero(state.option == UNDECIDED).tolist()
+        undecided = [i for i, index in enumerate(state.option.tolist()) if index == UNDECIDED]
         if undecided:
             state = state.copy()
         for i in undecided:
@@ -220,7 +220,9 @@ class Controller:
             state.decisions[i] += 1
             state.steps[i] = 0
         options = state.option.tolist()
-        aims = np.array([self._aim(*what) for what in zip(options, state.aim.tolist(), requests, strict=True)])
+        aims = np.array(
+            [self._aim(*what) for what in zip(options, state.aim.tolist(), requests, strict=True)], dtype=np.float32
+        )
         seen = self.view(observation["observation"], points, aims)
         if len(options) == 1:
             actions = self._actor(options[0]).act(seen)

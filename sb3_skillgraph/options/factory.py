@@ -53,13 +53,14 @@ class OptionFactory:
         self.rng = rng
         self.replay_kwargs = replay_kwargs
         self.device = device
+        self._low = action_space.low.ravel()
+        self._half = 0.5 * (action_space.high.ravel() - self._low)
         dim = view.dim(store.column("observation", np.arange(0)).shape[1], store.column("goal", np.arange(0)).shape[1])
         self.observation_space = spaces.Box(-np.inf, np.inf, (dim,), np.float32)
 
     def unscale(self, scaled: np.ndarray) -> np.ndarray:
         """Turn actions in [-1, 1], shape ``(n, action_dim)``, into the environment's own bounds."""
-        low, high = self.action_space.low.ravel(), self.action_space.high.ravel()
-        return low + 0.5 * (scaled + 1.0) * (high - low)
+        return self._low + self._half * (scaled + 1.0)
 
     def make(self, id: str, target: str | None, termination: TerminationSet | None) -> Option:
         """Make an option.

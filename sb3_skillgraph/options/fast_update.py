@@ -11,7 +11,7 @@ Nothing is kept beside the model: weights stay SB3's own parameters and the mome
 
 import functools
 from collections.abc import Callable, Iterable
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch as th
 from gymnasium import spaces
@@ -169,6 +169,11 @@ class Adam:
         """:return: what the optimiser learns"""
         return self.optimizer.param_groups[0]["params"]
 
+    @property
+    def moments(self) -> list[th.Tensor]:
+        """:return: the counts and running averages, as they are now"""
+        return [*self._counts, *self._averages, *self._squares]
+
     def follow(self) -> None:
         """Notice when ``load_state_dict`` has put another state in place of the one in use."""
         state = self.optimizer.state
@@ -212,6 +217,22 @@ class Adam:
         self._squares = [state["exp_avg_sq"] for state in states]
 
 
+class StepSettings(NamedTuple):
+    """
+    What a gradient step depends on beside the minibatch and the networks.
+
+    :param gamma: discount where the minibatch has none of its own
+    :param tau: SB3's soft update coefficient, 1 copies
+    :param noise_std: standard deviation of the noise on the target's actions (TD3's smoothing)
+    :param noise_clip: largest size of that noise
+    """
+
+    gamma: float
+    tau: float
+    noise_std: float
+    noise_clip: float
+
+
 class FastUpdate:
     """
     SB3's ``TD3.train`` for one policy, a gradient step at a time.
@@ -240,20 +261,34 @@ class FastUpdate:
         self.actor_adam.follow()
         self.critic_adam.follow()
 
-    def update_critics(
-        self, data: ReplayBufferSamples, gamma: float, noise_std: float, noise_clip: float
-    ) -> tuple[th.Tensor, th.Tensor]:
+    def constants(self) -> tuple[Any, ...]:
+        """Return all that a record of a gradient step would take for constant: where things lie, and learning rates."""
+        adams = (self.actor_adam, self.critic_adam)
+        tensors = [*self._learned, *self._targets, *(x for adam in adams for x in adam.moments)]
+        return *(x.data_ptr() for x in tensors), *(adam.optimizer.param_groups[0]["lr"] for adam in adams)
+
+    def step(self, data: ReplayBufferSamples, settings: StepSettings, with_actor: bool) -> tuple[th.Tensor, th.Tensor | None]:
         """
-        One gradient step of all critics towards the same target.
+        One gradient step.
 
         :param data: a minibatch of ``batch`` transitions
-        :param gamma: discount where the minibatch has none of its own
-        :param noise_std: standard deviation of the noise on the target's actions (TD3's smoothing)
-        :param noise_clip: largest size of that noise
-        :return: the critics' loss, (), and what they were given, (batch, observation + action)
+        :param settings: what else it depends on
+        :param with_actor: whether the actor learns too, and all targets move
+        :return: the critics' loss and the actor's, each (), None without the actor
         """
+        with th.inference_mode():
+            critic_loss, inputs = self._update_critics(data, settings)
+            if not with_actor:
+                return critic_loss, None
+            actor_loss = self._update_actor(inputs)
+            # Target networks move towards the learned ones.
+            th._foreach_lerp_(self._targets, self._learned, settings.tau)
+            return critic_loss, actor_loss
+
+    def _update_critics(self, data: ReplayBufferSamples, settings: StepSettings) -> tuple[th.Tensor, th.Tensor]:
+        """Teach all critics the same target; return their loss and what they were given, (batch, observation + action)."""
         inputs = th.cat([_flat(data.observations), data.actions], dim=1)
-        target = self._target(data, gamma, noise_std, noise_clip)
+        target = self._target(data, settings)
         losses: list[th.Tensor] = []
         gradients: list[th.Tensor] = []
         for critic in self.critics:
@@ -264,13 +299,8 @@ class FastUpdate:
         self.critic_adam.step(gradients)
         return losses[0] if len(losses) == 1 else th.stack(losses).sum(), inputs
 
-    def update_actor(self, inputs: th.Tensor) -> th.Tensor:
-        """
-        One gradient step of the actor up the first critic.
-
-        :param inputs: (batch, observation + action); the actions are overwritten by the actor's
-        :return: the actor's loss, ()
-        """
+    def _update_actor(self, inputs: th.Tensor) -> th.Tensor:
+        """Teach the actor to climb the first critic, overwriting the actions in ``inputs``; return its loss."""
         critic = self.critics[0]
         start = self.actor.layers[0].weight.shape[1]
         values = self.actor.forward(inputs[:, :start])
@@ -281,26 +311,18 @@ class FastUpdate:
         self.actor_adam.step(self.actor.parameter_gradients(values, gradient))
         return -critic_values[-1].mean()
 
-    def update_targets(self, tau: float) -> None:
-        """
-        Move all target networks towards the learned ones.
-
-        :param tau: SB3's soft update coefficient, 1 copies
-        """
-        th._foreach_lerp_(self._targets, self._learned, tau)
-
-    def _target(self, data: ReplayBufferSamples, gamma: float, noise_std: float, noise_clip: float) -> th.Tensor:
+    def _target(self, data: ReplayBufferSamples, settings: StepSettings) -> th.Tensor:
         observations = _flat(data.next_observations)
         # Drawn even where it is clipped to nothing (DDPG), so that the global generator ends where SB3 leaves it.
-        noise = th.empty_like(data.actions).normal_(0, noise_std)
+        noise = th.empty_like(data.actions).normal_(0, settings.noise_std)
         actions = self.actor_target.forward(observations)[-1].tanh_()
-        if noise_clip > 0:
-            actions = actions.add_(noise.clamp_(-noise_clip, noise_clip)).clamp_(-1, 1)
+        if settings.noise_clip > 0:
+            actions = actions.add_(noise.clamp_(-settings.noise_clip, settings.noise_clip)).clamp_(-1, 1)
         inputs = th.cat([observations, actions], dim=1)
         next_values = self.critic_targets[0].forward(inputs)[-1]
         for critic in self.critic_targets[1:]:
             next_values = th.minimum(next_values, critic.forward(inputs)[-1])
-        discounted = (1 - data.dones).mul_(gamma if data.discounts is None else data.discounts)
+        discounted = (1 - data.dones).mul_(settings.gamma if data.discounts is None else data.discounts)
         return th.addcmul(data.rewards, discounted, next_values).float()
 
 

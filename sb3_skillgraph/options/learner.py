@@ -11,7 +11,8 @@ from stable_baselines3.ddpg.ddpg import DDPG
 from stable_baselines3.td3.policies import TD3Policy
 from stable_baselines3.td3.td3 import TD3
 
-from sb3_skillgraph.options.fast_update import FastUpdate, why_not
+from sb3_skillgraph.options.cuda_graph import GraphedUpdate
+from sb3_skillgraph.options.fast_update import FastUpdate, StepSettings, why_not
 
 
 class OptionPolicy(TD3Policy):
@@ -51,7 +52,7 @@ class OptionLearner(TD3):
     ) -> None:
         self.actor_learning_rate = actor_learning_rate
         self.critic_learning_rate = critic_learning_rate
-        self._fast_update: FastUpdate | None = None
+        self._fast_update: FastUpdate | GraphedUpdate | None = None
         super().__init__(policy, env, learning_rate=critic_learning_rate, **kwargs)  # type: ignore[arg-type]
 
     def _setup_model(self) -> None:
@@ -89,22 +90,21 @@ class OptionLearner(TD3):
                 self.logger.record(name, sum(loss.item() for loss in losses) / len(losses))
 
     def _gradient_steps(
-        self, fast: FastUpdate, gradient_steps: int, batch_size: int
+        self, fast: FastUpdate | GraphedUpdate, gradient_steps: int, batch_size: int
     ) -> tuple[list[th.Tensor], list[th.Tensor]]:
         assert self.replay_buffer is not None
+        settings = StepSettings(self.gamma, self.tau, self.target_policy_noise, self.target_noise_clip)
         actor_losses, critic_losses = [], []
         for _ in range(gradient_steps):
             self._n_updates += 1
             data = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
-            with th.inference_mode():
-                loss, inputs = fast.update_critics(data, self.gamma, self.target_policy_noise, self.target_noise_clip)
-                critic_losses.append(loss)
-                if self._n_updates % self.policy_delay == 0:
-                    actor_losses.append(fast.update_actor(inputs))
-                    fast.update_targets(self.tau)
+            critic_loss, actor_loss = fast.step(data, settings, self._n_updates % self.policy_delay == 0)
+            critic_losses.append(critic_loss)
+            if actor_loss is not None:
+                actor_losses.append(actor_loss)
         return actor_losses, critic_losses
 
-    def _find_fast_update(self) -> FastUpdate | None:
+    def _find_fast_update(self) -> FastUpdate | GraphedUpdate | None:
         if self._fast_update is not None and self._fast_update.policy is self.policy:
             self._fast_update.follow()
             return self._fast_update
@@ -112,7 +112,8 @@ class OptionLearner(TD3):
         if reason is not None:
             _warn_once(reason)
             return None
-        self._fast_update = FastUpdate(self.policy)
+        fast = FastUpdate(self.policy)
+        self._fast_update = GraphedUpdate(fast) if self.device.type == "cuda" else fast
         return self._fast_update
 
     def _excluded_save_params(self) -> list[str]:

@@ -1,0 +1,195 @@
+"""
+What one environment step of ``learn()`` costs: ``SkillGraphAgent`` with a live graph against SB3's DDPG.
+
+Both learn in one process on one thread, on environments of their own, with the same networks, the same minibatch and
+one update per environment step; they take turns, so that what else the machine does hits both alike. Medians are over
+the turns. The breakdown: *simulation* is the environment's ``step`` as ``gym.make`` returns it, *update* is ``train``
+(sampling included), *rest* is all else: roll-out loop, choosing and ending options, the graph, the store.
+
+Run it with ``OMP_NUM_THREADS=1 python -m benchmarks.throughput --out benchmarks/results/throughput.json``.
+"""
+
+import argparse
+import json
+import statistics
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+import torch as th
+from stable_baselines3 import DDPG
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+
+from sb3_skillgraph import SkillGraphAgent
+
+ENVS = {"point": "SkillGraph/PointMazeMedium-v0", "ant": "SkillGraph/AntUMaze-v0"}
+WARM_UP = 3_000  # random steps, in whose trajectories the graph is laid
+PARTS = ("simulation", "update", "rest")
+
+
+class Case(NamedTuple):
+    """One row of the table; ``min_speedup`` and ``max_rest_ms`` are what is asked, None asks nothing."""
+
+    env: str
+    net_arch: tuple[int, ...]
+    batch_size: int
+    min_speedup: float | None = None
+    max_rest_ms: float | None = None
+
+
+CASES = [
+    Case("point", (400, 300), 64, 2.2, 0.15),
+    Case("ant", (400, 300), 64, 1.8, 0.20),
+    Case("point", (400, 300), 256),
+    Case("ant", (400, 300), 256),
+    Case("point", (128, 128), 128),
+    Case("ant", (128, 128), 128),
+]
+
+
+class Stopwatch:
+    """
+    Learns for some steps and tells where the time went.
+
+    :param model: the algorithm
+    :param env: what it learns from
+    """
+
+    def __init__(self, model: OffPolicyAlgorithm, env: gym.Env) -> None:
+        self.model = model
+        self.seconds = dict.fromkeys(PARTS, 0.0)
+        env.step = self._timed("simulation", env.step)  # type: ignore[method-assign]
+        model.train = self._timed("update", model.train)  # type: ignore[method-assign]
+
+    def _timed(self, part: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        def timed(*args: Any, **kwargs: Any) -> Any:
+            start = time.perf_counter()
+            result = function(*args, **kwargs)
+            self.seconds[part] += time.perf_counter() - start
+            return result
+
+        return timed
+
+    def learn(self, n_steps: int) -> dict[str, float]:
+        """
+        :param n_steps: environment steps
+        :return: milliseconds per step by part, and their sum as ``total``
+        """
+        self.seconds.update(dict.fromkeys(PARTS, 0.0))
+        start = time.perf_counter()
+        self.model.learn(n_steps, reset_num_timesteps=False, log_interval=10**9)
+        total = time.perf_counter() - start
+        self.seconds["rest"] = total - self.seconds["simulation"] - self.seconds["update"]
+        return {part: 1e3 * seconds / n_steps for part, seconds in (*self.seconds.items(), ("total", total))}
+
+
+def populate(agent: SkillGraphAgent, n_options: int) -> None:
+    """
+    Lay a graph of mature options along trajectories: from event to event, as if something else had shown the ways.
+
+    :param agent: one that has taken its warm-up steps
+    :param n_options: number of options
+    """
+    visited, stretch = agent.visited, 12
+    starts = np.linspace(0, visited.size - stretch - 1, n_options).astype(int)
+    paths = [visited.points[start : start + stretch].astype(np.float64) for start in starts]
+    for path in paths:
+        source, target = agent.discovery.add(path[0]), agent.discovery.add(path[-1])
+        chain = agent.chaining.open_chain(source, target)
+        agent.chaining.learn_success(agent.chaining.options[chain.options[0]], path[:-1], path[-1])
+    events = list(agent.graph.events.values())
+    visited.set_events(np.stack([event.center for event in events]), np.array([event.radius for event in events]))
+
+
+def build(case: Case, n_options: int) -> tuple[Stopwatch, Stopwatch]:
+    """
+    :param case: what to measure
+    :param n_options: options in the graph
+    :return: SB3's DDPG and our agent, both past their warm-up
+    """
+    common: dict[str, Any] = dict(
+        seed=0,
+        batch_size=case.batch_size,
+        train_freq=1,
+        gradient_steps=1,
+        learning_starts=WARM_UP,
+        policy_kwargs={"net_arch": list(case.net_arch)},
+        device="cpu",
+    )
+    envs = [gym.make(ENVS[case.env]) for _ in range(2)]
+    stock = DDPG("MultiInputPolicy", envs[0], buffer_size=100_000, **common)
+    agent = SkillGraphAgent("MultiInputPolicy", envs[1], buffer_size=100_000, **common)
+    for model in (stock, agent):
+        model.learn(WARM_UP, log_interval=10**9)
+    populate(agent, n_options)
+    return Stopwatch(stock, envs[0]), Stopwatch(agent, envs[1])
+
+
+def measure(case: Case, n_options: int, n_steps: int, n_turns: int) -> dict[str, Any]:
+    """
+    :param case: what to measure
+    :param n_options: options in the graph
+    :param n_steps: environment steps a turn
+    :param n_turns: number of turns
+    :return: ``sb3`` and ``ours`` (milliseconds per step by part), ``speedup`` (the median over turns of SB3's time over
+        ours), ``steps_per_second`` of both, ``options`` at the end
+    """
+    stock, ours = build(case, n_options)
+    turns = [[watch.learn(n_steps) for watch in (stock, ours)] for _ in range(n_turns + 1)][1:]
+    parts = (*PARTS, "total")
+    sb3_ms, ours_ms = ({part: round(statistics.median(turn[i][part] for turn in turns), 4) for part in parts} for i in (0, 1))
+    agent = ours.model
+    assert isinstance(agent, SkillGraphAgent)
+    return {
+        "sb3": sb3_ms,
+        "ours": ours_ms,
+        "speedup": round(statistics.median(a["total"] / b["total"] for a, b in turns), 3),
+        "steps_per_second": {"sb3": round(1e3 / sb3_ms["total"]), "ours": round(1e3 / ours_ms["total"])},
+        "options": len(agent.graph.options),
+    }
+
+
+def verdict(case: Case, row: dict[str, Any]) -> str:
+    """
+    :param case: what is asked
+    :param row: what was measured
+    :return: the bars that are missed, or "ok", or nothing where none is set
+    """
+    if case.min_speedup is None or case.max_rest_ms is None:
+        return ""
+    missed = [f"speedup < {case.min_speedup}"] if row["speedup"] < case.min_speedup else []
+    missed += [f"rest > {case.max_rest_ms} ms"] if row["ours"]["rest"] > case.max_rest_ms else []
+    return ", ".join(missed) or "ok"
+
+
+def main() -> None:
+    """Print the table, and write it where ``--out`` says."""
+    parser = argparse.ArgumentParser(description="Time learn() against SB3's.")
+    parser.add_argument("--options", type=int, default=20, help="options in the graph")
+    parser.add_argument("--steps", type=int, default=250, help="environment steps a turn")
+    parser.add_argument("--turns", type=int, default=20, help="turns of each")
+    parser.add_argument("--out", type=Path, help="JSON file for the results")
+    arguments = parser.parse_args()
+    th.set_num_threads(1)
+    results = []
+    print("milliseconds per environment step: simulation + update + rest = total")
+    print(f"{'case':<26}{'SB3':>34}{'ours':>34}{'speedup':>9}")
+    for case in CASES:
+        row = measure(case, arguments.options, arguments.steps, arguments.turns)
+        name = f"{case.env} {'-'.join(map(str, case.net_arch))} B={case.batch_size}"
+        columns = [
+            " + ".join(f"{times[part]:.2f}" for part in PARTS) + f" = {times['total']:.2f}"
+            for times in (row["sb3"], row["ours"])
+        ]
+        print(f"{name:<26}{columns[0]:>34}{columns[1]:>34}{row['speedup']:9.2f}  {verdict(case, row)}", flush=True)
+        results.append({**case._asdict(), **row})
+    if arguments.out is not None:
+        arguments.out.parent.mkdir(parents=True, exist_ok=True)
+        arguments.out.write_text(json.dumps({"torch": th.__version__, "cases": results}, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
