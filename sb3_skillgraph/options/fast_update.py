@@ -248,9 +248,8 @@ class FastUpdate:
         self.critic_targets = [Network(linears(q)) for q in policy.critic_target.q_networks]
         self.actor_adam = Adam(policy.actor.optimizer)
         self.critic_adam = Adam(policy.critic.optimizer)
-        self._learned = self.critic_adam.parameters + self.actor_adam.parameters
-        critic_targets = [parameter for critic in self.critic_targets for parameter in critic.parameters()]
-        self._targets = critic_targets + self.actor_target.parameters()
+        self._critic_targets = [parameter for critic in self.critic_targets for parameter in critic.parameters()]
+        self._actor_target = self.actor_target.parameters()
 
     def __reduce__(self) -> tuple[type["FastUpdate"], tuple[TD3Policy]]:
         # Copies and pickles look at their own policy afresh: nothing here is more than a view of it.
@@ -264,7 +263,8 @@ class FastUpdate:
     def constants(self) -> tuple[Any, ...]:
         """Return all that a record of a gradient step would take for constant: where things lie, and learning rates."""
         adams = (self.actor_adam, self.critic_adam)
-        tensors = [*self._learned, *self._targets, *(x for adam in adams for x in adam.moments)]
+        tensors = [x for adam in adams for x in (*adam.parameters, *adam.moments)]
+        tensors += self._critic_targets + self._actor_target
         return *(x.data_ptr() for x in tensors), *(adam.optimizer.param_groups[0]["lr"] for adam in adams)
 
     def step(self, data: ReplayBufferSamples, settings: StepSettings, with_actor: bool) -> tuple[th.Tensor, th.Tensor | None]:
@@ -280,9 +280,10 @@ class FastUpdate:
             critic_loss, inputs = self._update_critics(data, settings)
             if not with_actor:
                 return critic_loss, None
+            # Target networks move towards the learned ones as soon as those are done, while they are in the cache.
+            th._foreach_lerp_(self._critic_targets, self.critic_adam.parameters, settings.tau)
             actor_loss = self._update_actor(inputs)
-            # Target networks move towards the learned ones.
-            th._foreach_lerp_(self._targets, self._learned, settings.tau)
+            th._foreach_lerp_(self._actor_target, self.actor_adam.parameters, settings.tau)
             return critic_loss, actor_loss
 
     def _update_critics(self, data: ReplayBufferSamples, settings: StepSettings) -> tuple[th.Tensor, th.Tensor]:
