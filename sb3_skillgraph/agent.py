@@ -16,7 +16,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 from stable_baselines3.td3.policies import MultiInputPolicy
 
 from sb3_skillgraph.assembly import Assembly
-from sb3_skillgraph.controller import GLOBAL, ControllerState, Request
+from sb3_skillgraph.controller import GLOBAL, ControllerState, OptionOutcome, Request
 from sb3_skillgraph.goal_env import GoalSpec, as_batch, as_goal, check_finite, refuse_vec_normalize, rows, with_terminal
 from sb3_skillgraph.interrupts import Interrupts
 from sb3_skillgraph.options.learner import OptionDDPG
@@ -90,16 +90,19 @@ class SkillGraphAgent(Assembly):
         ``"uniform"`` (any event [3.2.2])
     :param explore_prob: probability that a mission explores: to the event nearest to a random point, and beyond
     :param exploration_steps: environment steps of such an exploration
-    :param practise_prob: probability that a mission goes to a random event of the graph
+    :param practise_prob: probability that a mission goes to an event that a path leads to
+    :param practise: which one: ``"least_tried"`` (whose last step on the path has run least often) or ``"random"``
     :param max_tries: timed-out options after which a mission is given up
     :param max_failures: timed-out options in a row after which a chain is given up; None for never
     :param link_reach: a crossing between two events in at most so many steps opens a chain between them; 0 for never
+    :param prune_after: episodes after which a chain is let go that no plan has used meanwhile; None for never
     :param off_policy_runs: whether any crossing between a chain's events counts for its gestating root
     :param containment: share of recent samples of an effect set that must lie in an initiation set for an edge; 1.0 is
         strict [3.2.6]
     :param evidence_edges: whether successful runs begun in an event make an edge too
-    :param rate_prior: pseudo-counts of a success and a failure in success rates [A.2: none]
+    :param rate_prior: pseudo-counts of successes and of failures in success rates [A.2: none]
     :param min_success_rate: success rate below which an edge is dropped
+    :param failure_cost: cost of a failed run in a plan, in successful ones [A.2: 1, which makes a weight 1 / success rate]
     :param nearest: vertex nearest to a goal: by ``"steps"`` along trajectories or ``"euclidean"`` distance [3.2.3]
     :param exploration_noise: standard deviation of Gaussian action noise, in units of the scaled action
     :param random_action_prob: probability of a uniformly random action
@@ -158,14 +161,17 @@ class SkillGraphAgent(Assembly):
         explore_prob: float = 0.2,
         exploration_steps: int = 100,
         practise_prob: float = 0.2,
+        practise: Literal["least_tried", "random"] = "least_tried",
         max_tries: int = 3,
         max_failures: int | None = 12,
         link_reach: int = 100,
+        prune_after: int | None = 50,
         off_policy_runs: bool = True,
         containment: float = 0.9,
         evidence_edges: bool = True,
-        rate_prior: float = 1.0,
-        min_success_rate: float = 0.2,
+        rate_prior: tuple[float, float] = (1.6, 0.4),
+        min_success_rate: float = 0.3,
+        failure_cost: float = 5.0,
         nearest: Literal["steps", "euclidean"] = "steps",
         exploration_noise: float = 0.1,
         random_action_prob: float = 0.1,
@@ -337,7 +343,15 @@ class SkillGraphAgent(Assembly):
             self._learn_from_step(reached, dones, infos)
             self._last_obs = new_obs
             self._pending = None
+            if self.pruning.due(self.curriculum.n_episodes):
+                self._prune()
             self._assign_missions()
+
+    def _prune(self) -> None:
+        running = {f"o{index}" for index in self._state.option.tolist()}
+        practised = {mission.chain for mission in self.curriculum.missions if mission.chain is not None}
+        self.pruning.prune(self.curriculum.n_episodes, running | practised)
+        self._executed = [index for index in self._executed if index == GLOBAL or f"o{index}" in self.chaining.options]
 
     def _start_over(self, new_obs: dict[str, np.ndarray], dones: np.ndarray) -> dict[str, np.ndarray]:
         """Reset environments once more where they are to start: the VecEnv's own resets know no options."""
@@ -458,16 +472,34 @@ class SkillGraphAgent(Assembly):
         :return: actions in the environment's own bounds, and the state
         :raises ValueError: if the observation does not fit the observation space
         """
+        actions, new_state, _ = self.act(observation, state, episode_start)
+        return actions, tuple(new_state)
+
+    def act(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+    ) -> tuple[np.ndarray, ControllerState, list[OptionOutcome]]:
+        """
+        Act as :meth:`predict` does, and tell which options have ended.
+
+        :param observation: one Dict observation, or a batch with a leading axis
+        :param state: what the last call returned; arrays of shape ``(n_envs,)``
+        :param episode_start: where an episode begins, and the state is forgotten; shape ``(n_envs,)``
+        :return: actions in the environment's own bounds, the state, and one outcome for each option that has ended
+        :raises ValueError: if the observation does not fit the observation space
+        """
         batch, vectorized = as_batch(observation, self.observation_space)
         n_envs = len(batch["achieved_goal"])
         running = ControllerState.fresh(n_envs) if state is None else ControllerState(*state)
         if episode_start is not None and np.any(episode_start):
             running = running.begun_anew(np.asarray(episode_start, dtype=bool))
         requests = [Request(goal) for goal in batch["desired_goal"]]
-        running, _ = self.controller.advance(running, batch["achieved_goal"], requests)
+        running, outcomes = self.controller.advance(running, batch["achieved_goal"], requests)
         scaled, _, running = self.controller.act(batch, running, requests)
         actions = self._factory.unscale(scaled).reshape((n_envs, *self._action_space().shape))
-        return (actions if vectorized else actions[0]), tuple(running)
+        return (actions if vectorized else actions[0]), running, outcomes
 
     def plan(self, obs: dict[str, np.ndarray], goal: np.ndarray | None = None) -> Plan:
         """

@@ -9,7 +9,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from sb3_skillgraph.chaining import DeepSkillChaining
 from sb3_skillgraph.controller import Controller, ControllerState
 from sb3_skillgraph.curriculum import Curriculum, Strategy
-from sb3_skillgraph.events import SalientEvent, TerminationSet
+from sb3_skillgraph.events import SalientEvent
 from sb3_skillgraph.goal_env import GoalSpec, Oracle, env_attribute, find_view
 from sb3_skillgraph.graph import SkillGraph
 from sb3_skillgraph.options.factory import OptionFactory, copy_policy
@@ -18,6 +18,7 @@ from sb3_skillgraph.options.option import Option
 from sb3_skillgraph.options.views import ScaledView
 from sb3_skillgraph.persistence import Persistence
 from sb3_skillgraph.planner import GraphPlanner
+from sb3_skillgraph.pruning import Pruning
 from sb3_skillgraph.replay import TransitionStore
 from sb3_skillgraph.salience.discovery import EventDiscovery
 from sb3_skillgraph.salience.proposals import FrontierSalience, RandomSalience, Salience
@@ -99,13 +100,17 @@ class Assembly(Persistence):
 
     def _build_skills(self) -> None:
         args = self._arguments
-        self.graph = SkillGraph(
-            self._spec.goal_dim, args["containment"], args["rate_prior"], args["evidence_edges"], args["min_success_rate"]
-        )
+        edges = ("containment", "rate_prior", "evidence_edges", "min_success_rate", "failure_cost")
+        self.graph = SkillGraph(self._spec.goal_dim, **{name: args[name] for name in edges})
         self.visited = VisitedStates(self._spec.goal_dim, 0.25 * self.event_radius, self.n_envs)
         self.planner = GraphPlanner(self.graph, self.visited, self.event_radius, args["event_reach"], args["nearest"])
         self.chaining = DeepSkillChaining(
-            self.graph, self._make_option, self._matured, args["gestation_period"], args["practice_runs"], args["max_failures"]
+            self.graph,
+            self._factory.make,
+            self._matured,
+            args["gestation_period"],
+            args["practice_runs"],
+            args["max_failures"],
         )
         self.controller = Controller(
             self.global_option,
@@ -130,6 +135,7 @@ class Assembly(Persistence):
             args["event_tries"],
             args["max_unconnected"],
         )
+        self.pruning = Pruning(self.chaining, self.visited, args["prune_after"])
         strategy = Strategy(**{name: args[name] for name in Strategy._fields})
         self.curriculum = Curriculum(
             self.graph,
@@ -155,9 +161,6 @@ class Assembly(Persistence):
                 "returns a point of goal space."
             )
         return salience
-
-    def _make_option(self, target: str, termination: TerminationSet) -> Option:
-        return self._factory.make(f"o{len(self.chaining.options) + 1}", target, termination)
 
     def _matured(self, option: Option) -> None:
         if self._arguments["warm_start"]:

@@ -1,6 +1,6 @@
 """Deep skill chaining: options learned backwards from an event until one can start where it must (sections 2.2, 3.2.5)."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -10,7 +10,7 @@ from sb3_skillgraph.events import SalientEvent, TerminationSet
 from sb3_skillgraph.graph import SkillGraph
 from sb3_skillgraph.options.option import Option
 
-MakeOption = Callable[[str, TerminationSet], Option]
+MakeOption = Callable[[str, str, TerminationSet], Option]
 
 
 @dataclass
@@ -48,7 +48,7 @@ class DeepSkillChaining:
     """Opens chains, lets their options gestate, and closes them.
 
     :param graph: the skill graph, which mature options join
-    :param make_option: makes a gestating option for a target id and a termination set
+    :param make_option: makes a gestating option of an id for a target id and a termination set
     :param on_maturity: called with an option the moment it matures (it then takes over the global policy)
     :param gestation_period: successes an option needs to mature
     :param practice_runs: successful runs of its own that an option needs before its chain is complete
@@ -73,6 +73,7 @@ class DeepSkillChaining:
         self.chains: dict[str, SkillChain] = {}
         self.options: dict[str, Option] = {}
         self.chain_of: dict[str, SkillChain] = {}
+        self.n_made = 0
 
     def open_chain(self, source: SalientEvent, target: SalientEvent, joins: bool = False) -> SkillChain:
         """Start (or take up again) the chain between two events.
@@ -84,15 +85,33 @@ class DeepSkillChaining:
         """
         id = f"{source.id}>{target.id}"
         if id not in self.chains:
-            chain = self.chains[id] = SkillChain(id, source.id, target.id, joins=joins)
-            self._grow(chain, target.id, target)
+            self.chains[id] = SkillChain(id, source.id, target.id, joins=joins)
         chain = self.chains[id]
         if chain.dropped:
             chain.dropped, chain.n_failures = False, 0
+        if not chain.options:
+            self._grow(chain, target.id, target)
         return chain
 
+    def remove(self, chains: Iterable[SkillChain]) -> list[str]:
+        """Let go of the options of some chains; what is left of such a chain tells that it has been there.
+
+        :param chains: chains without anything left to learn
+        :return: the ids of the options
+        """
+        ids = [id for chain in chains for id in chain.options]
+        in_graph = [id for id in ids if id in self.graph.options]
+        if in_graph:
+            self.graph.remove_options(in_graph)
+        for id in ids:
+            chain = self.chain_of.pop(id)
+            chain.options, chain.complete, chain.dropped = [], False, True
+            del self.options[id]
+        return ids
+
     def _grow(self, chain: SkillChain, target: str, termination: TerminationSet) -> None:
-        option = self.make_option(target, termination)
+        self.n_made += 1
+        option = self.make_option(f"o{self.n_made}", target, termination)
         self.options[option.id] = option
         self.chain_of[option.id] = chain
         chain.options.append(option.id)
@@ -175,7 +194,8 @@ class DeepSkillChaining:
 
     def get_state(self) -> dict[str, Any]:
         """Return chains and the order of the options as plain data."""
-        return {"chains": [vars(chain) for chain in self.chains.values()], "options": list(self.options)}
+        chains = [vars(chain) for chain in self.chains.values()]
+        return {"chains": chains, "options": list(self.options), "n_made": self.n_made}
 
     def set_state(self, state: dict[str, Any], options: dict[str, Option]) -> None:
         """Restore what :meth:`get_state` returned.
@@ -185,4 +205,5 @@ class DeepSkillChaining:
         """
         self.chains = {spec["id"]: SkillChain(**spec) for spec in state["chains"]}
         self.options = {id: options[id] for id in state["options"]}
+        self.n_made = state["n_made"]
         self.chain_of = {id: chain for chain in self.chains.values() for id in chain.options}

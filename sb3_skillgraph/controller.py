@@ -165,6 +165,9 @@ class Controller:
         ):
             if index == UNDECIDED:
                 continue
+            if index != GLOBAL and f"o{index}" not in self.chaining.options:
+                ended.append((i, Fate.TIMED_OUT))  # pruned meanwhile
+                continue
             timeout = self.timeout if index != GLOBAL else self.timeout // 2
             what = fate(self._reached(index, aim, requests[i], points[i]), steps, timeout)
             if what != Fate.RUNNING:
@@ -258,7 +261,7 @@ class Controller:
         """
         if request.direct or not self.planning:
             return GLOBAL, -1
-        avoid = [self.option(index).id for index in failed if index > GLOBAL]
+        avoid = [f"o{index}" for index in failed if index > GLOBAL]
         if request.chain is not None:
             return self._practise(point, request, failures, avoid)
         if request.event is not None:

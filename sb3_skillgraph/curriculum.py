@@ -15,6 +15,7 @@ from sb3_skillgraph.salience.discovery import EventDiscovery
 from sb3_skillgraph.visited import VisitedStates
 
 N_EXPLORED = 10  # candidates for an exploration
+LOOK_FOR_A_WAY = 0.75  # share of explorations among the missions to a goal that nothing ever came near
 JOINED_ALREADY = 3.0  # option runs the agent goes further to practise a chain that joins a new event
 
 
@@ -23,6 +24,7 @@ class Strategy(NamedTuple):
 
     target_choice: Literal["nearest", "uniform"]
     practise_prob: float
+    practise: Literal["least_tried", "random"]
     explore_prob: float
     exploration_steps: int
     max_tries: int
@@ -243,9 +245,12 @@ class Curriculum:
     def _crossed(self, env: int, source: SalientEvent, target: SalientEvent, end: np.ndarray) -> None:
         path = np.stack(self._since_event[env])
         chain = self.chaining.chains.get(f"{source.id}>{target.id}")
-        if chain is None and len(path) <= self.strategy.link_reach and self._detour(source, target):
+        known = self.graph.shortest_path([source.id], target.id)
+        # A way by way of others is a detour, unless a chain for it has been there and been let go.
+        missing = known is None or (chain is None and len(known.vertices) > 3)
+        if missing and (chain is None or not chain.options) and len(path) <= self.strategy.link_reach:
             chain = self.chaining.open_chain(source, target)
-        if chain is not None and self.strategy.off_policy_runs:
+        if chain is not None and chain.options and self.strategy.off_policy_runs:
             self._credit(chain, path, end)
 
     def _credit(self, chain: SkillChain, path: np.ndarray, end: np.ndarray) -> None:
@@ -254,16 +259,11 @@ class Curriculum:
         if not root.mature:
             self.chaining.learn_success(root, path, end, own=False)
 
-    def _detour(self, source: SalientEvent, target: SalientEvent) -> bool:
-        """Whether the graph knows no way between two events, or only one by way of others."""
-        path = self.graph.shortest_path([source.id], target.id)
-        return path is None or len(path.vertices) > 3
-
     # -- choosing a mission -------------------------------------------------------------------------------------------
 
     def _choose(self, point: np.ndarray) -> Mission:
         if self.pinned is not None:
-            return self._to_event(point, self.graph.events[self.pinned])
+            return self._adapt(point, self.graph.events[self.pinned])
         if self.discovery.due(self.n_episodes, self.graph.events.keys() - self.chaining.unsettled()):
             for event in self.discovery.attempt(self.n_episodes, self.rng):
                 self._join(event)
@@ -273,11 +273,28 @@ class Curriculum:
         if draw < self.strategy.explore_prob:
             return self._explore()
         if draw < self.strategy.explore_prob + self.strategy.practise_prob:
-            connected = self.graph.reachable("e0")
-            if len(connected) > 1:
-                return self._mission(self.graph.events[connected[self.rng.integers(len(connected))]], None)
+            practised = self._to_practise(point)
+            if practised is not None:
+                return self._mission(practised, None)
         chain = self._nearest_chain(point)
         return self._explore() if chain is None else self._mission(self.graph.events[chain.target], chain)
+
+    def _to_practise(self, point: np.ndarray) -> SalientEvent | None:
+        """Choose an event that a path leads to: any, or one whose last step has been tried least."""
+        if self.strategy.practise == "random":
+            connected = self.graph.reachable("e0")
+            return self.graph.events[connected[self.rng.integers(len(connected))]] if len(connected) > 1 else None
+        ways = self.graph.ways_from(self.graph.useful(point))
+        tries = {
+            id: len(self.graph.options[ways.path(id)[-2]].record)
+            for id, event in self.graph.events.items()
+            if id in ways and not event.holds(point)
+        }
+        if not tries:
+            return None
+        fewest = min(tries.values())
+        candidates = [id for id, n in tries.items() if n == fewest]
+        return self.graph.events[candidates[self.rng.integers(len(candidates))]]
 
     def _join(self, event: SalientEvent) -> None:
         """Open the chains that are to join a new event to the graph, there and back (sections 3.2.5, 3.2.7, A.3)."""
@@ -304,6 +321,13 @@ class Curriculum:
             return self._mission(event, None)
         chains = [c for c in self.chaining.chains.values() if c.target == event.id and c.open]
         return self._mission(event, chains[0] if chains else None)
+
+    def _adapt(self, point: np.ndarray, event: SalientEvent) -> Mission:
+        """Pursue the event that few-shot adaptation is for; look for a way to it while none is known (section 3.3)."""
+        unseen = len(self.visited.near(event.center, event.radius, exact=True)) == 0
+        if unseen and self.rng.random() < LOOK_FOR_A_WAY:
+            return self._explore(event.center)
+        return self._to_event(point, event)
 
     def _uniform(self, point: np.ndarray) -> Mission:
         """Any event, each as likely (section 3.2.2); backward chains open when forward ones are complete (A.3)."""
@@ -333,17 +357,21 @@ class Curriculum:
     def _random_walk(self) -> Mission:
         return Mission(self.graph.events["e0"].center, explore_steps=self.strategy.exploration_steps, exploring=True)
 
-    def _explore(self) -> Mission:
+    def _explore(self, towards: np.ndarray | None = None) -> Mission:
         """Return to where the agent has rarely been, and go on from there: at random, or towards a random point.
 
         Of some visited states, drawn as an RRT draws them (section 2.4: those nearest to uniform random points), it is
         the one with the fewest visits around it.
+
+        :param towards: a point that the random points are to surround as well, shape ``(goal_dim,)``
         """
         if self.visited.size < 2:
             return self._random_walk()
         steps = self.strategy.exploration_steps
         points, radius = self.visited.points, self.discovery.radius
-        samples = self.rng.uniform(points.min(axis=0) - radius, points.max(axis=0) + radius, (N_EXPLORED, points.shape[1]))
+        corners = [points.min(axis=0), points.max(axis=0), *([] if towards is None else [towards])]
+        lower, upper = np.min(corners, axis=0) - radius, np.max(corners, axis=0) + radius
+        samples = self.rng.uniform(lower, upper, (N_EXPLORED, points.shape[1]))
         nearest = [points[self.visited.near(sample, 0.0)[0]] for sample in samples]
         rarest = int(np.argmin([len(self.visited.near(point, radius)) for point in nearest]))
         beyond = samples[rarest] if self.rng.random() < 0.5 else None

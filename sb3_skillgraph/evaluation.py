@@ -1,5 +1,6 @@
 """From anywhere to anywhere: the success rate over random pairs of start and goal (section 4.2)."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
@@ -7,6 +8,8 @@ import gymnasium as gym
 import numpy as np
 from scipy.stats import binomtest
 
+from sb3_skillgraph.agent import SkillGraphAgent
+from sb3_skillgraph.controller import GLOBAL, ControllerState, OptionOutcome
 from sb3_skillgraph.envs import MazeGeometry
 
 
@@ -32,6 +35,7 @@ class PairResult(NamedTuple):
     :param success: whether the goal was reached
     :param steps: environment steps until then, or until the end of the episode
     :param status: which of the paper's cases the goal was to the agent's graph; None for agents that do not plan
+    :param trace: how the agent's options did on the way; None for agents without a skill graph
     """
 
     start: np.ndarray
@@ -40,6 +44,49 @@ class PairResult(NamedTuple):
     success: bool
     steps: int
     status: str | None
+    trace: "SkillTrace | None" = None
+
+
+class CalibrationBin(NamedTuple):
+    """Plans of about the same predicted success.
+
+    :param low: where the bin begins
+    :param n_plans: number of plans in it
+    :param predicted: their mean predicted success
+    :param observed: share of them that were followed to their end without a failure
+    """
+
+    low: float
+    n_plans: int
+    predicted: float
+    observed: float
+
+
+@dataclass
+class SkillTrace:
+    """How the options of a skill graph did on the way to one goal.
+
+    :param predicted: success probability of the plan at the start; None if it named no option to run
+    :param followed: whether the plan's last vertex, or the goal, was reached before any planned option failed
+    :param planned_steps: environment steps under options of the graph rather than the global option
+    :param n_runs: runs of such options that ended on the way
+    :param n_successes: how many of them reached their termination set
+    """
+
+    predicted: float | None
+    followed: bool | None = None
+    planned_steps: int = 0
+    n_runs: int = 0
+    n_successes: int = 0
+
+    def count(self, outcomes: Sequence[OptionOutcome]) -> None:
+        """Count the planned options that have ended."""
+        for outcome in outcomes:
+            if outcome.option != GLOBAL:
+                self.n_runs += 1
+                self.n_successes += bool(outcome.success)
+                if self.followed is None and not outcome.success:
+                    self.followed = False
 
 
 @dataclass(frozen=True)
@@ -62,6 +109,37 @@ class PairsResult:
         n_successes = sum(pair.success for pair in self.pairs)
         interval = binomtest(n_successes, len(self.pairs)).proportion_ci(0.95, method="wilson")
         return float(interval.low), float(interval.high)
+
+    @property
+    def traces(self) -> list[SkillTrace]:
+        """How the options did, pair by pair; empty for agents without a skill graph."""
+        return [pair.trace for pair in self.pairs if pair.trace is not None]
+
+    @property
+    def planned_share(self) -> float:
+        """Share of all environment steps that options of the graph took."""
+        return sum(trace.planned_steps for trace in self.traces) / max(sum(pair.steps for pair in self.pairs), 1)
+
+    @property
+    def option_success_rate(self) -> float:
+        """Share of the runs of planned options that succeeded (NaN without any)."""
+        n_runs = sum(trace.n_runs for trace in self.traces)
+        return sum(trace.n_successes for trace in self.traces) / n_runs if n_runs else float("nan")
+
+    def calibration(self, n_bins: int = 5) -> list[CalibrationBin]:
+        """Compare what plans promised with what became of them.
+
+        :param n_bins: number of equally wide bins of the predicted success
+        :return: the bins that hold plans, lowest first
+        """
+        plans = [(t.predicted, bool(t.followed)) for t in self.traces if t.predicted is not None]
+        bins = []
+        for low in np.arange(n_bins) / n_bins:
+            inside = [plan for plan in plans if low <= plan[0] < low + 1 / n_bins or (plan[0] == 1.0 == low + 1 / n_bins)]
+            if inside:
+                predicted, followed = np.mean(inside, axis=0).tolist()
+                bins.append(CalibrationBin(float(low), len(inside), predicted, followed))
+        return bins
 
 
 def sample_pairs(
@@ -137,7 +215,8 @@ def evaluate_pairs(
 
 def _run_pair(agent: Predictor, env: gym.Env, start: np.ndarray, goal: np.ndarray, cells: float) -> PairResult:
     observation, info = env.reset(options={"start": start, "goal": goal})
-    status = agent.plan(observation).status if hasattr(agent, "plan") else None
+    if isinstance(agent, SkillGraphAgent):
+        return _run_planner(agent, env, observation, info, goal, cells)
     state: tuple[np.ndarray, ...] | None = None
     episode_start = np.ones(1, dtype=bool)
     steps, over = 0, bool(info["is_success"])
@@ -147,4 +226,29 @@ def _run_pair(agent: Predictor, env: gym.Env, start: np.ndarray, goal: np.ndarra
         observation, _, terminated, truncated, info = env.step(action)
         steps += 1
         over = terminated or truncated
-    return PairResult(start, goal, cells, bool(info["is_success"]), steps, status)
+    return PairResult(start, goal, cells, bool(info["is_success"]), steps, None)
+
+
+def _run_planner(
+    agent: SkillGraphAgent, env: gym.Env, observation: Any, info: dict[str, Any], goal: np.ndarray, cells: float
+) -> PairResult:
+    """Do as any predictor would, with an eye on the options."""
+    start, plan = np.array(observation["achieved_goal"]), agent.plan(observation)
+    runs_options = agent.planning and any(vertex in agent.graph.options for vertex in plan.path)
+    trace = SkillTrace(plan.success_probability if runs_options else None)
+    end = agent.graph.events[plan.path[-1]] if plan.path else None
+    state: ControllerState | None = None
+    steps, over = 0, bool(info["is_success"])
+    while not over:
+        action, state, outcomes = agent.act(observation, state)
+        trace.count(outcomes)
+        if end is not None and trace.followed is None and end.holds(np.asarray(observation["achieved_goal"])):
+            trace.followed = True
+        observation, _, terminated, truncated, info = env.step(action)
+        steps += 1
+        trace.planned_steps += int(state.option[0] != GLOBAL)
+        over = terminated or truncated
+    success = bool(info["is_success"])
+    if trace.followed is None:
+        trace.followed = success
+    return PairResult(start, goal, cells, success, steps, plan.status, trace)

@@ -1,6 +1,5 @@
 """What the agent needs to know of a goal environment."""
 
-import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -10,6 +9,7 @@ from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_skillgraph.options.views import VIEWS, View
 
+FLOAT32_MAX = float(np.finfo(np.float32).max)
 KEYS = ("observation", "achieved_goal", "desired_goal")
 
 
@@ -135,9 +135,12 @@ def check_finite(observation: dict[str, np.ndarray], step: int) -> None:
     :raises ValueError: naming the entry, the environment and the step
     """
     for key in KEYS:
-        # The sum of squares tells at once that all is well; what it overflows on is looked at again.
-        if not (math.isfinite(np.vdot(observation[key], observation[key])) or np.isfinite(observation[key]).all()):
-            array = rows(observation, key)
+        # The sum of squares tells at once that all is well; where it is no number, or so large that a float32 may not
+        # hold what it comes from, the entry is looked at as it would be stored.
+        if np.vdot(observation[key], observation[key]) < FLOAT32_MAX:
+            continue
+        array = rows(observation, key)
+        if not np.isfinite(array).all():
             env = int(np.flatnonzero(~np.isfinite(array).all(axis=1))[0])
             raise ValueError(
                 f"{key!r} of environment {env} holds NaN or inf at step {step}: {array[env]}. The step was not stored; "

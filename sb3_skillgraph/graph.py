@@ -34,10 +34,10 @@ class SkillGraph:
     ============== ================================================ ==========================================
     edge           exists while                                     weight
     ============== ================================================ ==========================================
-    option, target the option has a success rate (it ends there)    1 / success rate
-    option, event  its effect set lies in the event                 1 / success rate
-    option, option the effect set of the first lies in the          1 / (success rate times the share of
-                   initiation set of the second                     effects inside)
+    option, target the option has a success rate (it ends there)    runs it takes to succeed, on average: one
+    option, event  its effect set lies in the event                 success and, ``failure_cost`` each, the
+    option, option the effect set of the first lies in the          failures before it; the success rate is
+                   initiation set of the second                     taken times the share of effects inside
     event, option  the event's trigger points lie in the option's   0 (to be in the event is to be able to
                    initiation set                                   start the option)
     ============== ================================================ ==========================================
@@ -47,19 +47,21 @@ class SkillGraph:
 
     :param goal_dim: dimension of goal space
     :param containment: share of samples that must lie inside; 1.0 is the paper's strict rule
-    :param rate_prior: pseudo-counts of a success and a failure in every success rate; 0 is the paper's plain fraction
+    :param rate_prior: pseudo-counts of successes and of failures in every success rate; zeros give the paper's fraction
     :param evidence_edges: whether runs begun in an event and mostly successful put the event into the option's
         initiation set, which makes an event-option edge
     :param min_success_rate: edges whose rate falls below it are dropped, so that no plan uses them
+    :param failure_cost: what a failed run costs, in successful ones; with 1 a weight is the paper's 1 / success rate
     """
 
     def __init__(
         self,
         goal_dim: int,
         containment: float = 0.9,
-        rate_prior: float = 1.0,
+        rate_prior: tuple[float, float] = (1.6, 0.4),
         evidence_edges: bool = True,
-        min_success_rate: float = 0.2,
+        min_success_rate: float = 0.3,
+        failure_cost: float = 5.0,
     ) -> None:
         self.nx = nx.DiGraph()
         self.goal_dim = goal_dim
@@ -67,6 +69,7 @@ class SkillGraph:
         self.rate_prior = rate_prior
         self.evidence_edges = evidence_edges
         self.min_success_rate = min_success_rate
+        self.failure_cost = failure_cost
         self.events: dict[str, SalientEvent] = {}
         self.options: dict[str, Option] = {}
         self.triggers: dict[str, deque[np.ndarray]] = {}
@@ -107,11 +110,15 @@ class SkillGraph:
         self._routes.add_vertex(id)
         self._changed()
 
-    def remove_option(self, option: Option) -> None:
-        """Take an option out of the graph, with all its edges."""
-        self.nx.remove_node(option.id)
-        del self.options[option.id]
-        self.evidence = {key: value for key, value in self.evidence.items() if key[1] != option.id}
+    def remove_options(self, ids: Collection[str]) -> None:
+        """Take options out of the graph, with all their edges.
+
+        :param ids: their ids
+        """
+        self.nx.remove_nodes_from(ids)
+        for id in ids:
+            del self.options[id]
+        self.evidence = {key: value for key, value in self.evidence.items() if key[1] in self.nx}
         self._index()
         self._changed()
 
@@ -236,7 +243,7 @@ class SkillGraph:
                 self._routes.remove_edge(source, target)
                 self._changed()
             return
-        weight = 1.0 / rate if weight is None else weight
+        weight = 1.0 + self.failure_cost * (1.0 / rate - 1.0) if weight is None else weight
         known = self.nx.get_edge_data(source, target)
         if known is None or known["success_rate"] != rate:
             self.nx.add_edge(source, target, weight=weight, success_rate=rate)

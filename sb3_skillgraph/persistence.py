@@ -23,6 +23,7 @@ from sb3_skillgraph.goal_env import refuse_vec_normalize
 from sb3_skillgraph.graph import SkillGraph
 from sb3_skillgraph.options.learner import OptionDDPG, OptionTD3
 from sb3_skillgraph.options.option import Option
+from sb3_skillgraph.pruning import Pruning
 from sb3_skillgraph.replay import TransitionStore
 from sb3_skillgraph.salience.discovery import EventDiscovery
 from sb3_skillgraph.saving import MissingCallable, PathOrFile, known_class, load_tree, save_tree
@@ -66,6 +67,7 @@ class Persistence(OffPolicyAlgorithm):
     chaining: DeepSkillChaining
     controller: Controller
     discovery: EventDiscovery
+    pruning: Pruning
     curriculum: Curriculum
     event_radius: float
     _arguments: dict[str, Any]
@@ -124,6 +126,7 @@ class Persistence(OffPolicyAlgorithm):
             "graph": self.graph.get_state(),
             "chaining": self.chaining.get_state(),
             "discovery": self.discovery.get_state(),
+            "pruning": self.pruning.get_state(),
             "visited": self.visited.get_state(),
         }
 
@@ -273,6 +276,7 @@ class Persistence(OffPolicyAlgorithm):
         self.graph.set_state(tree["graph"], options)
         self.chaining.set_state(tree["chaining"], options)
         self.discovery.set_state(tree["discovery"])
+        self.pruning.set_state(tree["pruning"])
         self.visited.set_state(tree["visited"])
         self.set_parameters(tree["parameters"], exact_match=True, device=self.device)
         self._restore_progress(tree["progress"], same_envs)

@@ -1,6 +1,6 @@
 """Cheapest ways over a graph that changes an edge at a time; SciPy's Dijkstra finds them."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 
 import numpy as np
 from scipy.sparse import csr_array
@@ -44,6 +44,16 @@ class Tree:
             path.append(self._ids[number])
             number = int(self._next[number])
         return path if self._towards else path[::-1]
+
+    def on_the_way(self, vertices: Iterable[str]) -> set[str]:
+        """Return all vertices on the cheapest ways to (or from) some that there are ways to, these included."""
+        seen: set[int] = set()
+        for vertex in vertices:
+            number = self._numbers[vertex] if vertex in self else -1
+            while number >= 0 and number not in seen:
+                seen.add(number)
+                number = int(self._next[number])
+        return {self._ids[number] for number in seen}
 
 
 class Routes:

@@ -26,10 +26,13 @@ TINY_NETS: dict[str, Any] = {"policy_kwargs": {"net_arch": [4]}}
 #: The graph as the paper has it: strict, from plain fractions, without edges from evidence.
 PAPER_GRAPH: dict[str, Any] = {
     "containment": 1.0,
-    "rate_prior": 0.0,
+    "rate_prior": (0.0, 0.0),
     "evidence_edges": False,
     "min_success_rate": 0.0,
+    "failure_cost": 1.0,
 }
+#: Rates and weights that are easily worked out by hand.
+PLAIN_WEIGHTS: dict[str, Any] = {"rate_prior": (1.0, 1.0), "min_success_rate": 0.2, "failure_cost": 1.0}
 
 
 def profile(max_examples: int, *, shrink: bool = True) -> settings:
@@ -123,7 +126,7 @@ class World:
     """A graph with all that plans and acts on it, to be filled by hand. Goal space is the plane, the radius 1."""
 
     def __init__(self, *, reach: int = 20, nearest: Any = "steps", timeout: int = 10, **graph_kwargs: Any) -> None:
-        self.graph = SkillGraph(2, **graph_kwargs)
+        self.graph = SkillGraph(2, **{**PLAIN_WEIGHTS, **graph_kwargs})
         self.visited = VisitedStates(2, 0.25)
         self.planner = GraphPlanner(self.graph, self.visited, 1.0, reach, nearest)
         self.made: list[Option] = []
@@ -142,8 +145,8 @@ class World:
         )
         self.clock = 0
 
-    def _make(self, target: str, termination: TerminationSet) -> Option:
-        option = make_option(f"o{len(self.chaining.options) + 1}", target, termination, seed=len(self.made) % 3 + 1)
+    def _make(self, id: str, target: str, termination: TerminationSet) -> Option:
+        option = make_option(id, target, termination, seed=len(self.made) % 3 + 1)
         self.made.append(option)
         return option
 

@@ -27,6 +27,7 @@ FLOORS: dict[str, float] = {
     "graph": 2,
     "goal_env": 2,
     "chaining": 3,
+    "pruning": 3.5,
     "salience": 3,
     "planner": 3,
     "controller": 4,

@@ -107,7 +107,7 @@ def test_outside_the_graph_the_agent_walks_to_where_it_can_be_entered(line: Worl
     assert len(xs) > 1
     assert (np.diff(xs) > 0).all() or (np.diff(xs) < 0).all()  # nearer with every waypoint
     for id in ("o1", "o2", "o3", "o4"):
-        line.graph.remove_option(line.graph.options[id])
+        line.graph.remove_options([id])
     points, aim = retrace(line, at(5.0)[0], to_event(line, "e2"))
     assert aim == 2  # to the event itself, where nothing leads on
     assert len(points) >= 2
@@ -126,7 +126,7 @@ def test_direct_requests_and_an_agent_that_does_not_plan_walk_straight(line: Wor
 
 
 def test_a_detour_around_the_option_that_has_just_failed(line: World) -> None:
-    detour = line.add_option(line.graph.events["e1"], (0.0, 0.0), failures=8)
+    detour = line.add_option(line.graph.events["e1"], (0.0, 0.0), failures=5)
     for request in (to_event(line, "e2"), Request(at(20.0)[0])):
         assert choose(line, 0.0, request) == (O1, -1)
         assert choose(line, 0.0, request, failed=[O1]) == (line.controller.index(detour), -1)
@@ -137,7 +137,7 @@ def test_a_detour_around_the_option_that_has_just_failed(line: World) -> None:
 
 def test_a_detour_around_an_option_that_failed_further_on(line: World) -> None:
     """Not only the option to begin with: none that has failed lately is in the plan if there is another way."""
-    straight = line.add_option(line.graph.events["e2"], (0.0, 0.0), failures=11)  # dearer than o1 and o2 together
+    straight = line.add_option(line.graph.events["e2"], (0.0, 0.0), failures=7)  # dearer than o1 and o2 together
     for request in (to_event(line, "e2"), Request(at(20.0)[0])):
         assert choose(line, 0.0, request) == (O1, -1)
         assert choose(line, 0.0, request, failed=[O1]) == (line.controller.index(straight), -1)
@@ -152,7 +152,7 @@ def test_a_goal_no_other_option_leads_to_is_walked_to_along_the_known_way(line: 
 
 
 def test_after_a_failed_approach_the_next_leg(line: World) -> None:
-    line.add_option(line.graph.events["e2"], (0.0, 0.0), failures=7)  # straight to e2, but dear
+    line.add_option(line.graph.events["e2"], (0.0, 0.0), failures=5)  # straight to e2, but dear
     goal = Request(at(14.0)[0])
     legs = line.planner.legs(at(0.0)[0], goal.goal)
     assert len({leg.path.vertices[0] for leg in legs if leg.path is not None}) >= 2
@@ -390,7 +390,7 @@ def test_the_last_two_options_that_failed_are_remembered(line: World) -> None:
 
 def test_what_failed_is_not_chosen_at_once_again(line: World) -> None:
     """Closed loop: what ``advance`` remembers, ``act`` avoids."""
-    detour = line.add_option(line.graph.events["e1"], (0.0, 0.0), failures=8)
+    detour = line.add_option(line.graph.events["e1"], (0.0, 0.0), failures=5)
     request = [to_event(line, "e2")]
     running = state(option=[O1], steps=[10])
     for expected in (line.controller.index(detour), O1, O1):  # after both have failed, there is no other way

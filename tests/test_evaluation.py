@@ -210,7 +210,7 @@ def test_no_plan_for_what_is_no_goal(trained: SkillGraphAgent, goal: Any) -> Non
 
 
 def test_adapt_makes_the_goal_an_event_and_pursues_it(trained: SkillGraphAgent) -> None:
-    goal = np.array([-1.2, -1.2])
+    goal = trained.visited.points[trained.visited.size // 2].astype(np.float64)
     n_events, n_steps = len(trained.events), trained.num_timesteps
     pursued: list[np.ndarray] = []
 

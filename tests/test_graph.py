@@ -5,7 +5,7 @@ import copy
 import networkx as nx
 import numpy as np
 import pytest
-from builders import PAPER_GRAPH, World, event, make_option, put_initiation
+from builders import PAPER_GRAPH, PLAIN_WEIGHTS, World, event, make_option, put_initiation
 
 from sb3_skillgraph.graph import SkillGraph
 from sb3_skillgraph.options.option import Option
@@ -14,7 +14,7 @@ E0, E1 = event(0, 0.0, 0.0), event(1, 10.0, 0.0)
 
 
 def two_events(**kwargs: object) -> SkillGraph:
-    graph = SkillGraph(2, **kwargs)  # type: ignore[arg-type]
+    graph = SkillGraph(2, **{**PLAIN_WEIGHTS, **kwargs})  # type: ignore[arg-type]
     graph.add_event(E0)
     graph.add_event(E1)
     return graph
@@ -107,6 +107,20 @@ def test_an_event_leads_into_an_option_while_its_triggers_lie_inside(containment
     assert graph.nx.has_edge("e0", "o1") == joined
 
 
+def test_by_default_rates_begin_high_and_failures_are_dear() -> None:
+    graph = SkillGraph(2)
+    graph.add_event(E0)
+    graph.add_event(E1)
+    graph.add_option(make_option("o1", "e1", E1, start=((0.0, 0.0), 2.0)))
+    assert graph.nx.edges["o1", "e1"]["success_rate"] == pytest.approx(0.8)
+    assert graph.nx.edges["o1", "e1"]["weight"] == pytest.approx(1 + 5 / 4)  # a quarter of a failure before a success
+    for _ in range(3):
+        ran(graph, graph.options["o1"], False)
+    assert graph.nx.edges["o1", "e1"]["success_rate"] == pytest.approx(1.6 / 5)
+    ran(graph, graph.options["o1"], False)
+    assert not graph.nx.has_edge("o1", "e1")
+
+
 def test_an_option_leads_into_another_while_its_effects_lie_inside() -> None:
     graph = two_events(**PAPER_GRAPH)
     first = leads_to_e1(effects=[(10.0, 0.0)] * 9, record=[True] * 9 + [False])
@@ -122,7 +136,7 @@ def test_an_option_leads_into_another_while_its_effects_lie_inside() -> None:
 
 
 def test_shares_of_effects_count_against_the_rate() -> None:
-    graph = two_events(rate_prior=0.0)
+    graph = two_events(rate_prior=(0.0, 0.0))
     first = leads_to_e1(effects=[(10.0, 0.0)] * 19 + [(10.7, 0.0)], record=[True] * 10)
     graph.add_option(make_option("o2", "e0", E0, start=((10.0, 0.0), 0.5), record=[True]))
     graph.add_option(first)
@@ -130,7 +144,7 @@ def test_shares_of_effects_count_against_the_rate() -> None:
 
 
 def test_an_option_leads_to_another_event_that_holds_its_effects() -> None:
-    graph = two_events(rate_prior=0.0)
+    graph = two_events(rate_prior=(0.0, 0.0))
     graph.add_event(event(2, 10.5, 0.0))
     option = leads_to_e1(effects=[(10.2, 0.0)] * 4, record=[True, False])
     graph.add_option(option)
@@ -332,7 +346,7 @@ def test_joined_pairs() -> None:
     assert world.graph.joined_pairs() == 0.0
     world.line()
     assert world.graph.joined_pairs() == 1.0
-    world.graph.remove_option(world.graph.options["o4"])  # back from e1 to e0
+    world.graph.remove_options(["o4"])  # back from e1 to e0
     assert world.graph.joined_pairs() == pytest.approx(4 / 6)
 
 
@@ -342,7 +356,7 @@ def test_a_removed_option_leaves_nothing_behind() -> None:
     option = world.graph.options["o1"]
     world.graph.ran_from(world.graph.events["e0"], option, True)
     assert world.planner.path_to(np.zeros(2), "e1") is not None
-    world.graph.remove_option(option)
+    world.graph.remove_options([option.id])
     assert "o1" not in world.graph.nx
     assert world.graph.startable(np.zeros(2)) == []
     assert world.planner.path_to(np.zeros(2), "e1") is None
@@ -360,7 +374,7 @@ def test_state_round_trip_keeps_how_ties_fall() -> None:
         ran(graph, graph.options["o5"], False)
     for _ in range(30):
         ran(graph, graph.options["o5"], True)  # its edge is now the youngest
-    restored = SkillGraph(2)
+    restored = SkillGraph(2, **PLAIN_WEIGHTS)
     restored.set_state(copy.deepcopy(graph.get_state()), graph.options)
     assert restored.shortest_path(["e0"], "e1") == graph.shortest_path(["e0"], "e1")
     assert nx.utils.graphs_equal(restored.nx.subgraph(graph.options), graph.nx.subgraph(graph.options))

@@ -32,9 +32,9 @@ def share_inside(option: Option, points: list[np.ndarray]) -> float:
     return float(option.initiation.optimistic(np.stack(points)).mean())
 
 
-def plain_rate(option: Option, prior: float) -> float:
-    n = len(option.record) + 2 * prior
-    return (sum(option.record) + prior) / n if n else 0.0
+def plain_rate(option: Option, prior: tuple[float, float]) -> float:
+    n = len(option.record) + prior[0] + prior[1]
+    return (sum(option.record) + prior[0]) / n if n else 0.0
 
 
 def option_event_rate(graph: SkillGraph, option: Option, id: str) -> float:
@@ -80,7 +80,8 @@ def check_edges(graph: SkillGraph) -> None:
         assert edge["success_rate"] >= graph.min_success_rate
         assert np.isfinite(edge["weight"])
         assert edge["weight"] >= 0
-        assert edge["weight"] == (0.0 if source in graph.events else 1.0 / edge["success_rate"])
+        failures = 1.0 / edge["success_rate"] - 1.0  # before a success, on average
+        assert edge["weight"] == (0.0 if source in graph.events else 1.0 + graph.failure_cost * failures)
 
 
 def check_regions(graph: SkillGraph, options: Iterable[Option]) -> None:
@@ -222,7 +223,7 @@ class History:
             self.graph.refresh(option, refitted=True)
         elif kind == "remove":
             if not any(other.target == option.id for other in self.graph.options.values()):
-                self.graph.remove_option(option)
+                self.graph.remove_options([option.id])
         else:
             self._run(option, np.array([x, 0.0]), kind == "success", extra)
 
@@ -285,7 +286,9 @@ def test_a_restored_graph_is_the_same_graph(
         history.apply(*operation)
         twin.apply(*operation)
     graph = twin.graph
-    restored = SkillGraph(2, graph.containment, graph.rate_prior, graph.evidence_edges, graph.min_success_rate)
+    restored = SkillGraph(
+        2, graph.containment, graph.rate_prior, graph.evidence_edges, graph.min_success_rate, graph.failure_cost
+    )
     restored.set_state(copy.deepcopy(graph.get_state()), graph.options)
     twin.world.graph = twin.graph = twin.world.planner.graph = restored
     for operation in [None, *after]:

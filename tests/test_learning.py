@@ -45,6 +45,34 @@ def test_reaches_goals_it_never_trained_on() -> None:
     assert summary["joined_pairs"] > 0.3
 
 
+def test_finds_a_way_to_a_region_that_training_never_reached() -> None:
+    """A door opens after training: adaptation looks for a way to the goal behind it, and old goals stay reachable."""
+    shut: MazeMap = [[1] * 7, [1, "r", 0, 1, 0, 0, 1], [1, 0, 0, 1, 0, 0, 1], [1] * 7]
+    opened: MazeMap = [[1] * 7, [1, "r", 0, 1, 0, 0, 1], [1, 0, 0, 0, 0, 0, 1], [1] * 7]
+    agent = SkillGraphAgent(
+        "MultiInputPolicy", gym.make(TOY, maze_map=shut), **{**SMALL, "policy_kwargs": dict(net_arch=[32, 32])}
+    )
+    agent.learn(3000, log_interval=None)
+    assert agent.visited.points[:, 0].max() < 0.0
+    env = gym.make(TOY, maze_map=opened, terminate_on_success=True)
+    old, new = np.array([-1.5, -0.5]), np.array([2.0, 0.5])
+    assert not reached(agent, env, new)
+    agent.set_env(gym.make(TOY, maze_map=opened))
+    agent.adapt(new, total_timesteps=2000)
+    assert reached(agent, env, new)
+    assert reached(agent, env, old)
+
+
+def reached(agent: SkillGraphAgent, env: gym.Env, goal: np.ndarray) -> bool:
+    observation, info = env.reset(seed=0, options={"start": np.array([-2.0, 0.5]), "goal": goal})
+    state, over = None, bool(info["is_success"])
+    while not over:
+        action, state = agent.predict(observation, state)
+        observation, _, terminated, truncated, info = env.step(action)
+        over = terminated or truncated
+    return bool(info["is_success"])
+
+
 @pytest.mark.parametrize(
     ("option_class", "extra"),
     [(TD3, {}), (SAC, {}), (OptionTD3, {}), (DDPG, dict(learning_rate=lambda left: 1e-3 * left))],

@@ -12,7 +12,7 @@ from sb3_skillgraph.options.initiation import InitiationSet
 from sb3_skillgraph.options.numpy_actor import NumpyActor
 from sb3_skillgraph.replay import OptionReplay, OptionRule
 
-RECORD_LENGTH = 20  # runs that count: an option's policy changes, and old runs speak of an old policy
+RECORD_LENGTH = 10  # runs that count: an option's policy changes, and old runs speak of an old policy
 EFFECTS_LENGTH = 50
 
 
@@ -97,14 +97,15 @@ class Option:
         assert center is not None, f"The target of option {self.id!r} has no centre to aim at."
         return np.asarray(center)
 
-    def success_rate(self, prior: float = 1.0) -> float:
+    def success_rate(self, prior: tuple[float, float] = (0.0, 0.0)) -> float:
         """Return the share of recent runs that succeeded.
 
-        :param prior: pseudo-counts of a success and of a failure; 0 gives the plain share (0 with no runs)
+        :param prior: pseudo-counts of successes and of failures (0 with neither them nor runs)
         :return: between 0 and 1
         """
-        n = len(self.record) + 2 * prior
-        return (sum(self.record) + prior) / n if n else 0.0
+        successes, failures = prior
+        n = len(self.record) + successes + failures
+        return (sum(self.record) + successes) / n if n else 0.0
 
     def succeeded(self, path: np.ndarray, end: np.ndarray, *, own: bool = True) -> None:
         """Learn from a run that reached the termination set.
