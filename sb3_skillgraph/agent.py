@@ -66,6 +66,7 @@ class SkillGraphAgent(Assembly):
         relative to where the agent stands), ``"egocentric"`` (without absolute position) or a function; None takes the
         one the environment names in its attribute ``option_view``, else ``"relative"``
     :param option_timeout: environment steps an option may run [A.6]
+    :param stall_steps: environment steps after which a run counts as failed that stands still; None for never
     :param event_radius: radius of salient events, in goal units; None takes the environment's ``success_radius`` or
         ``distance_threshold``
     :param gestation_period: successes after which an option is mature
@@ -142,6 +143,7 @@ class SkillGraphAgent(Assembly):
         option_kwargs: dict[str, Any] | None = None,
         option_view: str | View | None = None,
         option_timeout: int = 200,
+        stall_steps: int | None = 40,
         event_radius: float | None = None,
         gestation_period: int = 1,
         practice_runs: int = 2,

@@ -121,6 +121,7 @@ class Assembly(Persistence):
             args["goal_tolerance"] * self.event_radius,
             args["option_timeout"],
             args["warm_start"],
+            args["stall_steps"],
         )
 
     def _build_curriculum(self) -> None:

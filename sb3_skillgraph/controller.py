@@ -15,6 +15,7 @@ from sb3_skillgraph.options.option import Option
 from sb3_skillgraph.options.views import View
 from sb3_skillgraph.planner import GraphPlanner
 
+STILL = 0.25  # of the event radius: less is no movement
 MANY_DECISIONS = 12  # options on the way to a goal after which the next best way is tried
 UNDECIDED, GLOBAL = -1, 0  # no option yet; the global option. Others follow, in the order of their making.
 
@@ -30,6 +31,8 @@ class ControllerState(NamedTuple):
     :param failed_last: index of the option that failed last on the way to the goal, ``-1`` for none
     :param failed_before: index of the one that failed before it, ``-1`` for none
     :param decisions: options chosen so far on the way to the goal
+    :param anchor: distance from what the option aims at, when it last changed noticeably
+    :param still: environment steps since then
 
     States are never changed in place: the one before and the one after a step may share arrays.
     """
@@ -41,12 +44,14 @@ class ControllerState(NamedTuple):
     failed_last: np.ndarray
     failed_before: np.ndarray
     decisions: np.ndarray
+    anchor: np.ndarray
+    still: np.ndarray
 
     @classmethod
     def fresh(cls, n_envs: int) -> "ControllerState":
         """Return the state at the start of an episode."""
-        none, zero = np.full(n_envs, -1), np.zeros(n_envs, dtype=np.int64)
-        return cls(np.full(n_envs, UNDECIDED), zero, none, zero.copy(), none.copy(), none.copy(), zero.copy())
+        values: dict[str, float] = {"option": UNDECIDED, "aim": -1, "failed_last": -1, "failed_before": -1, "anchor": 0.0}
+        return cls(**{name: np.full(n_envs, values.get(name, 0)) for name in cls._fields})
 
     def begun_anew(self, where: np.ndarray) -> "ControllerState":
         """Return a state that is fresh for some environments.
@@ -108,6 +113,7 @@ class Controller:
     :param tolerance: distance within which a waypoint counts as reached, in goal units
     :param timeout: environment steps an option may run; the global option, half of them
     :param warm_start: whether gestating options act with the global option's policy
+    :param stall_steps: environment steps after which an option ends that does not move; None for never
 
     ``planning``: whether to use the graph at all; without it the global option walks straight to every goal.
     """
@@ -122,6 +128,7 @@ class Controller:
         tolerance: float,
         timeout: int,
         warm_start: bool,
+        stall_steps: int | None,
     ) -> None:
         self.global_option = global_option
         self.chaining = chaining
@@ -131,6 +138,7 @@ class Controller:
         self.tolerance = tolerance
         self.timeout = timeout
         self.warm_start = warm_start
+        self.stall_steps = stall_steps
         self.planning = True
 
     # -- options by number --------------------------------------------------------------------------------------------
@@ -159,23 +167,24 @@ class Controller:
         :param requests: what each is to do
         :return: the state, undecided where an option ended; one outcome per option that ended
         """
-        ended: list[tuple[int, Fate]] = []
-        for i, (index, aim, steps) in enumerate(
-            zip(state.option.tolist(), state.aim.tolist(), state.steps.tolist(), strict=True)
-        ):
+        ended: list[tuple[int, bool]] = []
+        for i, index in enumerate(state.option.tolist()):
             if index == UNDECIDED:
                 continue
-            if index != GLOBAL and f"o{index}" not in self.chaining.options:
-                ended.append((i, Fate.TIMED_OUT))  # pruned meanwhile
-                continue
-            timeout = self.timeout if index != GLOBAL else self.timeout // 2
-            what = fate(self._reached(index, aim, requests[i], points[i]), steps, timeout)
+            what = self._fate(index, state, i, points[i], requests[i])
             if what != Fate.RUNNING:
-                ended.append((i, what))
+                ended.append((i, what == Fate.SUCCEEDED))
         if not ended:
             return state, []
         state = state.copy()
-        return state, [self._end(state, i, what == Fate.SUCCEEDED) for i, what in ended]
+        return state, [self._end(state, i, success) for i, success in ended]
+
+    def _fate(self, index: int, state: ControllerState, i: int, point: np.ndarray, request: Request) -> Fate:
+        if index != GLOBAL and f"o{index}" not in self.chaining.options:
+            return Fate.TIMED_OUT  # pruned meanwhile
+        stalled = self.stall_steps is not None and int(state.still[i]) >= self.stall_steps
+        timeout = 0 if stalled else self.timeout if index != GLOBAL else self.timeout // 2
+        return fate(self._reached(index, int(state.aim[i]), request, point), int(state.steps[i]), timeout)
 
     def _reached(self, index: int, aim: int, request: Request, point: np.ndarray) -> bool:
         if index != GLOBAL:
@@ -221,7 +230,7 @@ class Controller:
             retracing = bool(state.aim[i] < -1)
             state.option[i], state.aim[i] = self.choose(points[i], requests[i], failures, failed, retracing)
             state.decisions[i] += 1
-            state.steps[i] = 0
+            state.steps[i], state.still[i], state.anchor[i] = 0, 0, np.inf
         options = state.option.tolist()
         aims = np.array(
             [self._aim(*what) for what in zip(options, state.aim.tolist(), requests, strict=True)], dtype=np.float32
@@ -231,7 +240,15 @@ class Controller:
             actions = self._actor(options[0]).act(seen)
         else:
             actions = np.concatenate([self._actor(index).act(seen[i : i + 1]) for i, index in enumerate(options)])
-        return actions, aims, state._replace(steps=state.steps + 1)
+        still, anchor = self._watch(state, points, aims)
+        return actions, aims, state._replace(steps=state.steps + 1, still=still, anchor=anchor)
+
+    def _watch(self, state: ControllerState, points: np.ndarray, aims: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Count the steps for which an agent has stood still: its distance from where it is going tells."""
+        offsets = points - aims
+        distances = np.sqrt(np.einsum("ij,ij->i", offsets, offsets))
+        moved = ~(np.abs(distances - state.anchor) < STILL * self.radius)
+        return np.where(moved, 0, state.still + 1), np.where(moved, distances, state.anchor)
 
     def _actor(self, index: int) -> NumpyActor:
         option = self.option(index)

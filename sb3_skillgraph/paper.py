@@ -34,5 +34,6 @@ PAPER: dict[str, Any] = dict(
     goal_tolerance=1.0,
     shared_experience=0.0,
     warm_start=False,
+    stall_steps=None,
     global_update_fraction=0.0,
 )

@@ -141,7 +141,7 @@ class World:
         )
         self.global_option = make_option("global", None, None, seed=0)
         self.controller = Controller(
-            self.global_option, self.chaining, self.planner, ScaledView(relative_view, 1.0), 1.0, 0.5, timeout, False
+            self.global_option, self.chaining, self.planner, ScaledView(relative_view, 1.0), 1.0, 0.5, timeout, False, None
         )
         self.clock = 0
 

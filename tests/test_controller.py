@@ -66,7 +66,7 @@ def test_a_fresh_state_is_undecided() -> None:
     assert fresh.failed_last.tolist() == fresh.failed_before.tolist() == fresh.aim.tolist() == [-1] * 3
     copied = fresh.copy()
     assert not any(np.shares_memory(a, b) for a, b in zip(copied, fresh, strict=True))
-    assert len({array.__array_interface__["data"][0] for array in fresh}) == len(fresh) == 7
+    assert len({array.__array_interface__["data"][0] for array in fresh}) == len(fresh) == 9
 
 
 # -- choosing ---------------------------------------------------------------------------------------------------------
@@ -456,7 +456,9 @@ def test_gestating_options_act_with_the_global_policy_only_when_warm_started(lin
     root = line.chaining.options[chain.options[0]]
     request = [Request(at(20.0)[0], event="e2", chain=chain.id)]
     cold = line.controller
-    warm = Controller(line.global_option, line.chaining, line.planner, cold.view, 1.0, 0.5, 10, warm_start=True)
+    warm = Controller(
+        line.global_option, line.chaining, line.planner, cold.view, 1.0, 0.5, 10, warm_start=True, stall_steps=None
+    )
     observation = observe(at(0.0))
     seen = cold.view(observation["observation"], observation["achieved_goal"], at(20.0))
     for controller, mature, actor in (
@@ -468,3 +470,23 @@ def test_gestating_options_act_with_the_global_policy_only_when_warm_started(lin
         actions, _, _ = controller.act(observation, state(option=[controller.index(root)]), request)
         np.testing.assert_array_equal(actions, actor.act(seen))
     assert not np.allclose(root.actor.act(seen), line.global_option.actor.act(seen))
+
+
+@pytest.mark.parametrize("stall_steps", [3, None])
+def test_an_option_that_stands_still_ends_as_failed(line: World, stall_steps: int | None) -> None:
+    controller, request = line.controller, [to_event(line, "e1")]
+    controller.stall_steps = stall_steps
+    state, ends = ControllerState.fresh(1), []
+    for step, x in enumerate([0.0, 0.3, 0.6, 0.9, 0.9, 0.95, 0.9, 0.9, 0.9]):  # walks, then trembles against a wall
+        state, outcomes = controller.advance(state, at(x), request)
+        ends += [(step, outcome.option, outcome.success) for outcome in outcomes]
+        _, _, state = controller.act(observe(at(x)), state, request)
+    assert ends == ([(7, O1, False)] if stall_steps else [])
+    assert int(state.failed_last[0]) == (O1 if stall_steps else -1)
+
+
+def test_standing_still_counts_anew_for_every_option(line: World) -> None:
+    line.controller.stall_steps = 3
+    request = [to_event(line, "e1")]
+    _, _, state = line.controller.act(observe(at(0.0)), ControllerState.fresh(1)._replace(still=np.array([2])), request)
+    assert int(state.still[0]) == 0

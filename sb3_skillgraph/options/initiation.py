@@ -126,9 +126,11 @@ class InitiationSet:
             points = np.concatenate([positives, negatives])
             machine = SVC(kernel="rbf", gamma=gamma, class_weight="balanced").fit(points, classes)
             split = Boundary(machine.support_vectors_, machine.dual_coef_[0], float(machine.intercept_[0]), gamma)
-            self.optimistic_boundaries.append(split)
-            accepted = positives[split.inside(positives)]
-            accepted = accepted if len(accepted) else positives
+            inside = split.inside(positives)
+            # A split that leaves no success on its side says nothing of where: that the option fails is for its rate.
+            if inside.any():
+                self.optimistic_boundaries.append(split)
+                accepted = positives[inside]
         # What another option aims at must be somewhere this one can start: the core lies inside the optimistic set.
         self.pessimistic_boundaries = [_one_class(accepted, 0.1, gamma), *self.optimistic_boundaries]
         self.core = self._deepest(accepted)
