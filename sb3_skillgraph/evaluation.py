@@ -9,7 +9,7 @@ import numpy as np
 from scipy.stats import binomtest
 
 from sb3_skillgraph.agent import SkillGraphAgent
-from sb3_skillgraph.controller import GLOBAL, ControllerState, OptionOutcome
+from sb3_skillgraph.controller import GLOBAL, OptionOutcome
 from sb3_skillgraph.envs import MazeGeometry
 
 
@@ -215,40 +215,44 @@ def evaluate_pairs(
 
 def _run_pair(agent: Predictor, env: gym.Env, start: np.ndarray, goal: np.ndarray, cells: float) -> PairResult:
     observation, info = env.reset(options={"start": start, "goal": goal})
-    if isinstance(agent, SkillGraphAgent):
-        return _run_planner(agent, env, observation, info, goal, cells)
+    watch = _Watch(agent, observation) if isinstance(agent, SkillGraphAgent) else None
     state: tuple[np.ndarray, ...] | None = None
     episode_start = np.ones(1, dtype=bool)
     steps, over = 0, bool(info["is_success"])
     while not over:
-        action, state = agent.predict(observation, state=state, episode_start=episode_start, deterministic=True)
+        if watch is not None:
+            action, state = watch.act(observation, state)
+        else:
+            action, state = agent.predict(observation, state=state, episode_start=episode_start, deterministic=True)
         episode_start = np.zeros(1, dtype=bool)
         observation, _, terminated, truncated, info = env.step(action)
         steps += 1
         over = terminated or truncated
-    return PairResult(start, goal, cells, bool(info["is_success"]), steps, None)
-
-
-def _run_planner(
-    agent: SkillGraphAgent, env: gym.Env, observation: Any, info: dict[str, Any], goal: np.ndarray, cells: float
-) -> PairResult:
-    """Do as any predictor would, with an eye on the options."""
-    start, plan = np.array(observation["achieved_goal"]), agent.plan(observation)
-    runs_options = agent.planning and any(vertex in agent.graph.options for vertex in plan.path)
-    trace = SkillTrace(plan.success_probability if runs_options else None)
-    end = agent.graph.events[plan.path[-1]] if plan.path else None
-    state: ControllerState | None = None
-    steps, over = 0, bool(info["is_success"])
-    while not over:
-        action, state, outcomes = agent.act(observation, state)
-        trace.count(outcomes)
-        if end is not None and trace.followed is None and end.holds(np.asarray(observation["achieved_goal"])):
-            trace.followed = True
-        observation, _, terminated, truncated, info = env.step(action)
-        steps += 1
-        trace.planned_steps += int(state.option[0] != GLOBAL)
-        over = terminated or truncated
     success = bool(info["is_success"])
-    if trace.followed is None:
-        trace.followed = success
-    return PairResult(start, goal, cells, success, steps, plan.status, trace)
+    if watch is None:
+        return PairResult(start, goal, cells, success, steps, None)
+    return PairResult(start, goal, cells, success, steps, watch.plan.status, watch.ended(success))
+
+
+class _Watch:
+    """Does what an agent's ``predict`` does, with an eye on its options."""
+
+    def __init__(self, agent: SkillGraphAgent, observation: Any) -> None:
+        self.agent = agent
+        self.plan = agent.plan(observation)
+        runs_options = agent.planning and any(vertex in agent.graph.options for vertex in self.plan.path)
+        self.trace = SkillTrace(self.plan.success_probability if runs_options else None)
+        self.end = agent.graph.events[self.plan.path[-1]] if self.plan.path else None
+
+    def act(self, observation: Any, state: tuple[np.ndarray, ...] | None) -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
+        action, new_state, outcomes = self.agent.act(observation, state)
+        self.trace.count(outcomes)
+        if self.end is not None and self.trace.followed is None and self.end.holds(np.asarray(observation["achieved_goal"])):
+            self.trace.followed = True
+        self.trace.planned_steps += int(new_state.option[0] != GLOBAL)
+        return action, new_state
+
+    def ended(self, success: bool) -> SkillTrace:
+        if self.trace.followed is None:
+            self.trace.followed = success
+        return self.trace
