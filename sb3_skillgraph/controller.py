@@ -245,10 +245,14 @@ class Controller:
 
     def _watch(self, state: ControllerState, points: np.ndarray, aims: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Count the steps for which an agent has stood still: its distance from where it is going tells."""
-        offsets = points - aims
-        distances = np.sqrt(np.einsum("ij,ij->i", offsets, offsets))
-        moved = ~(np.abs(distances - state.anchor) < STILL * self.radius)
-        return np.where(moved, 0, state.still + 1), np.where(moved, distances, state.anchor)
+        still, anchor = state.still.tolist(), state.anchor.tolist()
+        for i, (point, aim) in enumerate(zip(points.tolist(), aims.tolist(), strict=True)):
+            distance = math.dist(point, aim)
+            if abs(distance - anchor[i]) < STILL * self.radius:
+                still[i] += 1
+            else:
+                still[i], anchor[i] = 0, distance
+        return np.array(still), np.array(anchor)
 
     def _actor(self, index: int) -> NumpyActor:
         option = self.option(index)

@@ -220,6 +220,8 @@ def test_refit_waits_for_news() -> None:
     initiation.add_failure(np.full(2, 9.0))
     assert initiation.refit()  # a fifth of what is known
     assert not initiation.refit()
+    assert not initiation.refit(force=True)  # nothing at all is new
+    initiation.add_failure(np.full(2, 9.0))
     assert initiation.refit(force=True)
 
 

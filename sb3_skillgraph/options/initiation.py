@@ -7,6 +7,7 @@ from collections import deque
 from typing import Any, NamedTuple
 
 import numpy as np
+import sklearn
 from sklearn.svm import SVC, OneClassSVM
 
 # Successes cover an option's region densely, so few trajectories with few points each describe it well.
@@ -108,13 +109,19 @@ class InitiationSet:
     def refit(self, force: bool = False) -> bool:
         """Fit the set to its examples, if enough of them are new.
 
-        :param force: fit whatever has changed
+        :param force: fit if anything at all is new
         :return: whether the set was fitted
         """
         known = len(self.successes)
-        if not known or not (force or self._n_news * 5 >= known):
+        if not known or not self._n_news or not (force or self._n_news * 5 >= known):
             return False
         self._n_news = 0
+        # What scikit-learn would check takes it longer than the fit.
+        with sklearn.config_context(assume_finite=True, skip_parameter_validation=True):
+            self._fit()
+        return True
+
+    def _fit(self) -> None:
         positives = np.concatenate([*self.successes, *self.regions.values()])
         negatives = self._standing_failures()
         # A floor under the kernel's width: a handful of points in one spot still describe a place, not a point.
@@ -134,7 +141,6 @@ class InitiationSet:
         # What another option aims at must be somewhere this one can start: the core lies inside the optimistic set.
         self.pessimistic_boundaries = [_one_class(accepted, 0.1, gamma), *self.optimistic_boundaries]
         self.core = self._deepest(accepted)
-        return True
 
     def _standing_failures(self) -> np.ndarray:
         """Return the failed starts that later successes have not outvoted, shape ``(n, goal_dim)``."""
