@@ -9,7 +9,7 @@ from sb3_skillgraph.events import SalientEvent
 from sb3_skillgraph.graph import GraphPath, SkillGraph
 from sb3_skillgraph.visited import VisitedStates
 
-_Table = Callable[[np.ndarray, float], dict[int, int]]
+_Table = Callable[[np.ndarray, float, tuple[int, ...]], dict[int, int]]
 Status = Literal["in_graph", "in_initiation_set", "outside"]
 
 
@@ -88,15 +88,20 @@ class GraphPlanner:
         :return: events and distances: steps, as trajectories passed them on the way to the goal (or, less surely, came
             back from it), or goal units if ``nearest`` is ``euclidean``
         """
-        return self._ranked(goal, self.visited.events_before, self.visited.events_after)
+        # An event that nothing leads to, as that of a goal being adapted to may be, is none to leave the graph at.
+        events = self.graph.event_bank.holding(goal)
+        without = tuple(int(event.id[1:]) for event in events if self.graph.nx.in_degree(event.id) == 0)
+        return self._ranked(goal, self.visited.events_before, self.visited.events_after, without)
 
-    def _ranked(self, point: np.ndarray, seen: _Table, reversed_: _Table) -> list[tuple[SalientEvent, float]]:
+    def _ranked(
+        self, point: np.ndarray, seen: _Table, reversed_: _Table, without: tuple[int, ...] = ()
+    ) -> list[tuple[SalientEvent, float]]:
         if self.nearest == "euclidean" or self.visited.size == 0:
             distances = [(event, float(np.linalg.norm(event.center - point))) for event in self.graph.events.values()]
         else:
             steps: dict[int, float] = {}
             for table, doubt in ((seen, 1.0), (reversed_, 1.5)):
-                for index, n in table(point, self.radius).items():
+                for index, n in table(point, self.radius, without).items():
                     steps[index] = min(steps.get(index, np.inf), doubt * n)
             distances = [(self.graph.events[f"e{index}"], n) for index, n in steps.items()]
         return sorted(distances, key=lambda pair: pair[1])

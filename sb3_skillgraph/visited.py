@@ -48,7 +48,7 @@ class VisitedStates:
         self._n_trajectories = n_envs
         self._centers = np.zeros((0, goal_dim), dtype=np.float64)
         self._radii = np.zeros(0, dtype=np.float64)
-        self._passed: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None = None
+        self._passed: dict[tuple[int, ...], tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]] = {}
         self._places = [_NOWHERE] * n_envs
 
     @property
@@ -128,7 +128,7 @@ class VisitedStates:
         self._label[i] = label
         self._last_point[env_index] = point
         self.size += 1
-        self._passed = None
+        self._passed.clear()
 
     def _forget_older_half(self) -> None:
         keep = slice(self.size // 2, self.size)
@@ -148,7 +148,7 @@ class VisitedStates:
         self._centers = np.asarray(centers, dtype=np.float64).reshape(-1, self.goal_dim)
         self._radii = np.asarray(radii, dtype=np.float64)
         self._label[: self.size] = self.label(self.points)
-        self._passed = None
+        self._passed.clear()
         self._places = [_NOWHERE] * len(self._current)
 
     def label(self, points: np.ndarray) -> np.ndarray:
@@ -190,13 +190,17 @@ class VisitedStates:
         inside = np.flatnonzero(squared <= radius**2)
         return inside if len(inside) or exact else squared.argmin(keepdims=True)
 
-    def _events_passed(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """For each point: the last event before it on its trajectory, steps since; the next one, steps until."""
-        if self._passed is None:
+    def _events_passed(self, without: tuple[int, ...] = ()) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """For each point: the last event before it on its trajectory, steps since; the next one, steps until.
+
+        :param without: indices of events that count as none
+        """
+        if without not in self._passed:
             n = self.size
             # Trajectories of parallel environments interleave: walk them one after the other.
             order = np.lexsort((self._step[:n], self._trajectory[:n]))
-            trajectory, step, label = self._trajectory[:n][order], self._step[:n][order], self._label[:n][order]
+            trajectory, step = self._trajectory[:n][order], self._step[:n][order]
+            label = np.where(np.isin(self._label[:n], without), -1, self._label[:n])[order]
             position = np.arange(n)
             before = np.maximum.accumulate(np.where(label >= 0, position, -1))
             after = np.minimum.accumulate(np.where(label >= 0, position, n)[::-1])[::-1]
@@ -209,27 +213,29 @@ class VisitedStates:
                 event[order] = np.where(exists, label[pointer], -1)
                 steps[order] = np.abs(step - step[pointer])
                 columns += [event, steps]
-            self._passed = (columns[0], columns[1], columns[2], columns[3])
-        return self._passed
+            self._passed[without] = (columns[0], columns[1], columns[2], columns[3])
+        return self._passed[without]
 
-    def events_before(self, point: np.ndarray, radius: float) -> dict[int, int]:
+    def events_before(self, point: np.ndarray, radius: float, without: tuple[int, ...] = ()) -> dict[int, int]:
         """Return the events last passed on the way to a point, with the fewest steps from each.
 
         :param point: shape ``(goal_dim,)``
         :param radius: how near a trajectory must come to the point, in goal units
+        :param without: indices of events that count as none
         :return: event index -> steps, fewest first
         """
-        event, steps, _, _ = self._events_passed()
+        event, steps, _, _ = self._events_passed(without)
         return _fewest(event, steps, self.near(point, radius))
 
-    def events_after(self, point: np.ndarray, radius: float) -> dict[int, int]:
+    def events_after(self, point: np.ndarray, radius: float, without: tuple[int, ...] = ()) -> dict[int, int]:
         """Return the events reached next from a point, with the fewest steps to each.
 
         :param point: shape ``(goal_dim,)``
         :param radius: how near a trajectory must come to the point, in goal units
+        :param without: indices of events that count as none
         :return: event index -> steps, fewest first
         """
-        _, _, event, steps = self._events_passed()
+        _, _, event, steps = self._events_passed(without)
         return _fewest(event, steps, self.near(point, radius))
 
     def steps_between(self, start: np.ndarray, goal: np.ndarray, radius: float) -> float:
@@ -347,7 +353,7 @@ class VisitedStates:
         self._current = np.array(state["current"], dtype=np.int64)
         self._last_point = np.array(state["last_point"], dtype=np.float32)
         self._n_trajectories, self.n_forgotten = int(state["n_trajectories"]), int(state["n_forgotten"])
-        self._passed = None
+        self._passed.clear()
         self._places = [_NOWHERE] * len(self._current)
 
 

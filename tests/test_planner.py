@@ -145,6 +145,20 @@ def test_coming_back_from_a_goal_tells_less_than_going_there() -> None:
     assert back / there == pytest.approx(1.5, rel=0.2)
 
 
+def test_an_event_that_nothing_leads_to_is_none_to_leave_the_graph_at(line: World) -> None:
+    """The goal of an adaptation is such an event: the graph is left where the way to it began."""
+    goal = line.add_event(20.0, 10.0)
+    line.walk((20, 0), (20, 10), 30)
+    ranked = [event.id for event, _ in line.planner.vertices_near(goal.center)]
+    assert (ranked[0], goal.id in ranked) == ("e2", False)
+    legs = line.planner.legs(at(0.0), goal.center)
+    assert legs[0].path is not None
+    assert legs[0].path.vertices[-1] == "e2"
+    option = line.add_option(goal, (20.0, 0.0))
+    assert next(iter(line.planner.vertices_near(goal.center)))[0] is goal
+    assert option.id in line.planner.plan(at(0.0), goal.center, 1.0).path
+
+
 def test_legs_are_sorted_and_add_up(line: World) -> None:
     legs = line.planner.legs(at(0.0), at(14.0))
     assert [leg.cost for leg in legs] == sorted(leg.cost for leg in legs)

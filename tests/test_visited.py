@@ -281,6 +281,18 @@ def test_many_points_outgrow_the_first_arrays() -> None:
     assert visited.points[:, 0].tolist() == list(range(3000))
 
 
+def test_events_that_count_as_none_are_looked_through() -> None:
+    visited = VisitedStates(2, SPACING)
+    visited.set_events(np.array([[0.0, 0.0], [4.0, 0.0]]), np.array([0.5, 0.5]))
+    straight(visited, 8)
+    point = np.array([6.0, 0.0])
+    assert visited.events_before(point, 0.1) == {1: 2}
+    assert visited.events_before(point, 0.1, (1,)) == {0: 6}
+    assert visited.events_before(point, 0.1, (0, 1)) == {}
+    assert visited.events_after(np.array([2.0, 0.0]), 0.1, (1,)) == {}
+    assert visited.events_before(point, 0.1) == {1: 2}
+
+
 def test_cut_ends_every_trajectory() -> None:
     visited = VisitedStates(2, SPACING)
     visited.set_events(np.array([[0.0, 0.0]]), np.array([0.5]))
