@@ -374,18 +374,19 @@ TABLE_KEYS = {"time/episodes", "time/fps", "time/time_elapsed", "time/total_time
 def test_csv_log(tmp_path: Path) -> None:
     agent = new_agent()
     agent.set_logger(configure(str(tmp_path), ["csv"]))
-    agent.learn(1000, log_interval=2)
+    agent.learn(2000, log_interval=2)
+    agent.logger.close()
     with open(tmp_path / "progress.csv", newline="") as file:
         entries = list(csv.DictReader(file))
     assert set(entries[-1]) >= KEYS | TABLE_KEYS
-    assert [int(entry["time/total_timesteps"]) for entry in entries] == list(range(200, 1001, 200))
+    assert [int(entry["time/total_timesteps"]) for entry in entries] == list(range(200, 2001, 200))
     last = {key: float(value) for key, value in entries[-1].items()}
     assert last["skillgraph/events"] == len(agent.events)
     assert last["skillgraph/edges"] > 0
     assert last["rollout/ep_len_mean"] == 100
     for name in ("joined_pairs", "coverage"):
         assert 0.0 < last[f"skillgraph/{name}"] <= 1.0
-    assert last["train/n_updates"] == 799  # an entry is written before the updates of its step
+    assert last["train/n_updates"] == 1799  # an entry is written before the updates of its step
 
 
 def test_tensorboard_log(tmp_path: Path) -> None:
