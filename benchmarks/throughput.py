@@ -25,6 +25,7 @@ from stable_baselines3 import DDPG
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_skillgraph import SkillGraphAgent
+from sb3_skillgraph.events import SalientEvent
 
 ENVS = {"point": "SkillGraph/PointMazeMedium-v0", "ant": "SkillGraph/AntUMaze-v0"}
 WARM_UP = 3_000  # random steps, in whose trajectories the graph is laid
@@ -96,14 +97,23 @@ def populate(agent: SkillGraphAgent, n_options: int) -> None:
     :param n_options: number of options
     """
     visited, stretch = agent.visited, 12
-    starts = np.linspace(0, visited.size - stretch - 1, n_options).astype(int)
-    paths = [visited.points[start : start + stretch].astype(np.float64) for start in starts]
-    for path in paths:
-        source, target = agent.discovery.add(path[0]), agent.discovery.add(path[-1])
-        chain = agent.chaining.open_chain(source, target)
-        agent.chaining.learn_success(agent.chaining.options[chain.options[0]], path[:-1], path[-1])
+    for start in np.linspace(0, visited.size - stretch - 1, 50 * n_options).astype(int):
+        path = visited.points[start : start + stretch].astype(np.float64)
+        source, target = (agent.planner.event_at(point) or add_event(agent, point) for point in (path[0], path[-1]))
+        if source is not target and f"{source.id}>{target.id}" not in agent.chaining.chains:
+            chain = agent.chaining.open_chain(source, target)
+            agent.chaining.learn_success(agent.chaining.options[chain.options[0]], path[:-1], path[-1])
+        if len(agent.graph.options) == n_options:
+            return
+    raise RuntimeError(f"The warm-up's trajectories gave only {len(agent.graph.options)} options: lengthen it.")
+
+
+def add_event(agent: SkillGraphAgent, point: np.ndarray) -> SalientEvent:
+    """Add an event where none is yet."""
+    added = agent.discovery.add(point)
     events = list(agent.graph.events.values())
-    visited.set_events(np.stack([event.center for event in events]), np.array([event.radius for event in events]))
+    agent.visited.set_events(np.stack([event.center for event in events]), np.array([event.radius for event in events]))
+    return added
 
 
 def build(case: Case, n_options: int) -> tuple[Stopwatch, Stopwatch]:
