@@ -23,6 +23,7 @@ from joblib import Parallel, delayed
 from benchmarks.zero_shot import summary
 from sb3_skillgraph import SkillGraphAgent, __version__
 from sb3_skillgraph.envs import MazeGeometry, MazeMap
+from sb3_skillgraph.evaluation import run_pair
 
 ENV = "SkillGraph/PointMaze-v0"
 DOOR = (4, 4)
@@ -68,16 +69,7 @@ class Halves:
 
 def success(agent: SkillGraphAgent, env: gym.Env, pairs: list[tuple[np.ndarray, np.ndarray]]) -> float:
     """Return the share of pairs of start and goal between which the agent finds its way."""
-    hits = []
-    for start, goal in pairs:
-        observation, info = env.reset(options={"start": start, "goal": goal})
-        state, over = None, bool(info["is_success"])
-        while not over:
-            action, state = agent.predict(observation, state)
-            observation, _, terminated, truncated, info = env.step(action)
-            over = terminated or truncated
-        hits.append(bool(info["is_success"]))
-    return float(np.mean(hits))
+    return float(np.mean([run_pair(agent, env, start, goal, np.nan).success for start, goal in pairs]))
 
 
 def run_seed(args: argparse.Namespace, seed: int) -> dict[str, Any]:

@@ -245,11 +245,11 @@ class Curriculum:
     def _crossed(self, env: int, source: SalientEvent, target: SalientEvent, end: np.ndarray) -> None:
         path = np.stack(self._since_event[env])
         chain = self.chaining.chains.get(f"{source.id}>{target.id}")
-        known = self.graph.shortest_path([source.id], target.id)
-        # A way by way of others is a detour, unless a chain for it has been there and been let go.
-        missing = known is None or (chain is None and len(known.vertices) > 3)
-        if missing and (chain is None or not chain.options) and len(path) <= self.strategy.link_reach:
-            chain = self.chaining.open_chain(source, target)
+        if (chain is None or not chain.options) and len(path) <= self.strategy.link_reach:
+            known = self.graph.shortest_path([source.id], target.id)
+            # A way by way of others is a detour, unless a chain for it has been there and been let go.
+            if known is None or (chain is None and len(known.vertices) > 3):
+                chain = self.chaining.open_chain(source, target)
         if chain is not None and chain.options and self.strategy.off_policy_runs:
             self._credit(chain, path, end)
 

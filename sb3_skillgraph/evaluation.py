@@ -205,7 +205,7 @@ def evaluate_pairs(
             if adapt_timesteps:
                 tested = tested.copy(gym.make(env_id, **(env_kwargs or {})))
                 tested.adapt(goal, start=start, total_timesteps=adapt_timesteps)
-            results.append(_run_pair(tested, env, start, goal, cells))
+            results.append(run_pair(tested, env, start, goal, cells))
             if tested is not agent:
                 tested.get_env().close()
         return PairsResult(results)
@@ -213,7 +213,16 @@ def evaluate_pairs(
         env.close()
 
 
-def _run_pair(agent: Predictor, env: gym.Env, start: np.ndarray, goal: np.ndarray, cells: float) -> PairResult:
+def run_pair(agent: Predictor, env: gym.Env, start: np.ndarray, goal: np.ndarray, cells: float) -> PairResult:
+    """Let an agent go from a start to a goal.
+
+    :param agent: anything with SB3's ``predict``
+    :param env: a ``SkillGraph/*`` environment that ends its episode on success
+    :param start: shape ``(goal_dim,)``
+    :param goal: shape ``(goal_dim,)``
+    :param cells: length of the shortest free path, in cells
+    :return: what became of it
+    """
     observation, info = env.reset(options={"start": start, "goal": goal})
     watch = _Watch(agent, observation) if isinstance(agent, SkillGraphAgent) else None
     state: tuple[np.ndarray, ...] | None = None
