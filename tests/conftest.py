@@ -3,6 +3,7 @@
 import copy
 import io
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -39,6 +40,13 @@ EAGER: dict[str, Any] = dict(
     event_reach=10,
     salient_event_freq=3,
 )
+
+
+@pytest.fixture(autouse=True, scope="session")
+def ctrl_c_is_heard() -> None:
+    """A shell lets what it starts in the background ignore it; the tests press it themselves."""
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def new_agent(env: gym.Env | VecEnv | str = TOY, **kwargs: Any) -> SkillGraphAgent:

@@ -4,12 +4,10 @@ import copy
 import warnings
 
 import gymnasium as gym
-import numpy as np
 import pytest
 import torch as th
-from gymnasium import spaces
+from learners import distance, make, train
 from stable_baselines3 import DDPG, TD3
-from stable_baselines3.common.logger import Logger
 
 from sb3_skillgraph import SkillGraphAgent
 from sb3_skillgraph.options import cuda_graph, learner
@@ -20,44 +18,8 @@ from sb3_skillgraph.options.learner import OptionDDPG, OptionTD3
 needs_gpu = pytest.mark.skipif(not th.cuda.is_available(), reason="needs a GPU")
 
 
-def make(cls: type[TD3], device: str = "cpu", net_arch: tuple[int, ...] = (16, 16)) -> TD3:
-    kwargs = {"learning_rate": 1e-3}
-    if issubclass(cls, OptionDDPG | OptionTD3):
-        kwargs = {"actor_learning_rate": 1e-3, "critic_learning_rate": 1e-3}
-    model = cls(
-        "MlpPolicy",
-        None,  # type: ignore[arg-type]
-        policy_kwargs={"net_arch": list(net_arch)},
-        buffer_size=500,
-        device=device,
-        _init_setup_model=False,
-        **kwargs,
-    )
-    model.observation_space = spaces.Box(-np.inf, np.inf, (6,), np.float32)
-    model.action_space = spaces.Box(-1, 1, (2,), np.float32)
-    model.n_envs = 1
-    th.manual_seed(0)
-    model._setup_model()
-    model.set_logger(Logger(None, []))
-    buffer, rng = model.replay_buffer, np.random.default_rng(0)
-    assert buffer is not None
-    buffer.observations[:] = rng.normal(size=buffer.observations.shape)
-    buffer.next_observations[:] = rng.normal(size=buffer.next_observations.shape)
-    buffer.actions[:] = rng.uniform(-1, 1, buffer.actions.shape)
-    buffer.rewards[:] = rng.integers(-1, 1, buffer.rewards.shape)
-    buffer.full = True
-    return model
-
-
-def train(model: TD3, steps: int, batch_size: int = 32, seed: int = 1) -> None:
-    np.random.seed(seed)  # noqa: NPY002
-    th.manual_seed(seed)
-    model.train(steps, batch_size)
-
-
-def distance(a: TD3, b: TD3) -> float:
-    pairs = zip(a.policy.parameters(), b.policy.parameters(), strict=True)
-    return max((p.cpu() - q.cpu()).abs().max().item() for p, q in pairs)
+NET = [16, 16]
+RATE = 1e-3  # of both networks, as SB3 has it
 
 
 @pytest.fixture
@@ -76,12 +38,12 @@ def captures(monkeypatch: pytest.MonkeyPatch) -> list[object]:
 
 @pytest.mark.parametrize("cls", [OptionDDPG, OptionTD3])
 def test_replays_what_the_update_does(cls: type[TD3], captures: list[object], monkeypatch: pytest.MonkeyPatch) -> None:
-    graphed = make(cls)
+    graphed = make(cls, NET)
     train(graphed, 40)
     assert isinstance(graphed._fast_update, GraphedUpdate)
     assert len(captures) == (1 if cls is OptionDDPG else 2)  # TD3: with and without the actor
     monkeypatch.setattr(learner, "FastUpdate", FastUpdate)
-    eager = make(cls)
+    eager = make(cls, NET)
     train(eager, 40)
     assert isinstance(eager._fast_update, FastUpdate)
     assert distance(graphed, eager) == 0.0
@@ -93,7 +55,7 @@ def test_what_changes_is_captured_anew(captures: list[object], monkeypatch: pyte
     for graphed in (True, False):
         if not graphed:
             monkeypatch.setattr(learner, "FastUpdate", FastUpdate)
-        model = make(OptionDDPG)
+        model = make(OptionDDPG, NET)
         train(model, 10)
         train(model, 10, batch_size=48)
         assert isinstance(model, OptionDDPG)
@@ -113,7 +75,7 @@ def test_without_graphs_it_warns_once_and_goes_on(captures: list[object], monkey
         raise RuntimeError("operation not permitted when stream is capturing")
 
     monkeypatch.setattr(cuda_graph, "capture", refuse)
-    model = make(OptionDDPG)
+    model = make(OptionDDPG, NET)
     train(model, WARM_UP)
     with pytest.warns(UserWarning, match="without CUDA graphs, more slowly: operation not permitted") as caught:
         train(model, 10)
@@ -127,7 +89,8 @@ def test_without_graphs_it_warns_once_and_goes_on(captures: list[object], monkey
 @needs_gpu
 @pytest.mark.parametrize(("stock", "ours"), [(DDPG, OptionDDPG), (TD3, OptionTD3)])
 def test_two_hundred_updates_are_sb3s_on_a_gpu(stock: type[TD3], ours: type[TD3]) -> None:
-    a, b = make(stock, "cuda", (400, 300)), make(ours, "cuda", (400, 300))
+    a = make(stock, [400, 300], learning_rate=RATE, device="cuda")
+    b = make(ours, [400, 300], actor_learning_rate=RATE, critic_learning_rate=RATE, device="cuda")
     b.policy.load_state_dict(a.policy.state_dict())
     if ours is OptionTD3:  # the noise is drawn from another place of the generator's sequence
         a.target_policy_noise = b.target_policy_noise = 0.0

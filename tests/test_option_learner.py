@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
+from learners import ACTOR_LR, CRITIC_LR, distance, fill, make, train
 from stable_baselines3 import DDPG, SAC, TD3
 from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.logger import Logger
@@ -15,8 +16,6 @@ from sb3_skillgraph.options.fast_update import FastUpdate, is_vector_space
 from sb3_skillgraph.options.learner import OptionDDPG, OptionTD3
 from sb3_skillgraph.options.numpy_actor import NumpyActor
 
-ACTOR_LR, CRITIC_LR = 3e-4, 2e-3
-
 
 @pytest.fixture(autouse=True)
 def one_thread():
@@ -24,31 +23,6 @@ def one_thread():
     th.set_num_threads(1)
     yield
     th.set_num_threads(threads)
-
-
-def fill(buffer, seed=0):
-    rng = np.random.default_rng(seed)
-    buffer.observations[:] = rng.normal(size=buffer.observations.shape)
-    buffer.next_observations[:] = rng.normal(size=buffer.next_observations.shape)
-    buffer.actions[:] = rng.uniform(-1, 1, buffer.actions.shape)
-    buffer.rewards[:] = rng.normal(size=buffer.rewards.shape)
-    buffer.dones[:] = rng.random(buffer.dones.shape) < 0.1
-    buffer.full = True
-
-
-def make(cls, net_arch, n_obs=6, n_act=2, obs_shape=None, policy_kwargs=None, seed=0, **kwargs):
-    if issubclass(cls, (OptionDDPG, OptionTD3)):
-        kwargs = {"actor_learning_rate": ACTOR_LR, "critic_learning_rate": CRITIC_LR, **kwargs}
-    policy_kwargs = {"net_arch": net_arch, **(policy_kwargs or {})}
-    model = cls("MlpPolicy", None, policy_kwargs=policy_kwargs, buffer_size=500, _init_setup_model=False, **kwargs)
-    model.observation_space = spaces.Box(-np.inf, np.inf, obs_shape or (n_obs,), np.float32)
-    model.action_space = spaces.Box(-1, 1, (n_act,), np.float32)
-    model.n_envs = 1
-    th.manual_seed(seed)
-    model._setup_model()
-    model.set_logger(Logger(None, []))
-    fill(model.replay_buffer)
-    return model
 
 
 def stock_twin(model, cls):
@@ -66,16 +40,6 @@ def stock_twin(model, cls):
 
     twin._update_learning_rate = update_learning_rate
     return twin
-
-
-def train(model, steps, batch_size=32, seed=1):
-    np.random.seed(seed)  # noqa: NPY002
-    th.manual_seed(seed)
-    model.train(steps, batch_size)
-
-
-def distance(a, b):
-    return max((p - q).abs().max().item() for p, q in zip(a.policy.parameters(), b.policy.parameters(), strict=True))
 
 
 def same(a, b):
