@@ -26,6 +26,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "defaults": {},
     "paper": PAPER,
     "no global option to start from": {"warm_start": False},
+    "saturated actors": {"saturation_penalty": 0.0},
     "no hindsight": {"hindsight": 0.0},
     "own experience only": {"shared_experience": 0.0},
     "goals as wide as events": {"goal_tolerance": 1.0},

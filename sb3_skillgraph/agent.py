@@ -75,6 +75,8 @@ class SkillGraphAgent(Assembly):
         them learn from scratch
     :param global_update_fraction: share of the updates that goes to the global option; executed options share the rest
         (which the global option takes too while none of them is to be trained)
+    :param saturation_penalty: weight, in the loss of ``OptionDDPG``'s and ``OptionTD3``'s actors, of the mean square of
+        what their tanh is given: keeps them from getting stuck at the bounds of the actions
     :param hindsight: share of sampled transitions relabelled with a goal achieved later
     :param goal_tolerance: how near the global option must come to a goal, and any option to one put in by hindsight, for
         it to learn that it has reached it; in event radii
@@ -149,6 +151,7 @@ class SkillGraphAgent(Assembly):
         practice_runs: int = 2,
         warm_start: bool = True,
         global_update_fraction: float = 0.5,
+        saturation_penalty: float = 1e-3,
         hindsight: float = 0.8,
         goal_tolerance: float = 0.5,
         shared_experience: float = 0.5,

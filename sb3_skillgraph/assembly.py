@@ -94,6 +94,7 @@ class Assembly(Persistence):
                     f"{option_class.__name__} takes constant learning rates; for a schedule use option_class=TD3 or SAC."
                 )
             kwargs.update(actor_learning_rate=self.learning_rate, critic_learning_rate=self.learning_rate)
+            kwargs.update(saturation_penalty=self._arguments["saturation_penalty"])
         else:
             kwargs.update(learning_rate=self.learning_rate)
         return {**kwargs, **(self._arguments["option_kwargs"] or {})}

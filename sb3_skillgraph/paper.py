@@ -36,4 +36,5 @@ PAPER: dict[str, Any] = dict(
     warm_start=False,
     stall_steps=None,
     global_update_fraction=0.0,
+    saturation_penalty=0.0,
 )

@@ -12,7 +12,7 @@ from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.logger import Logger
 
 from sb3_skillgraph.options import learner as learner_module
-from sb3_skillgraph.options.fast_update import FastUpdate, is_vector_space
+from sb3_skillgraph.options.fast_update import FastUpdate, StepSettings, is_vector_space
 from sb3_skillgraph.options.learner import OptionDDPG, OptionTD3
 from sb3_skillgraph.options.numpy_actor import NumpyActor
 
@@ -328,3 +328,23 @@ def test_numpy_actor_asks_torch_about_other_networks():
         actor, observations = NumpyActor(model.policy.actor), np.ones((3, 6), np.float32)
         assert not actor._layers
         assert np.allclose(actor.act(observations), model.predict(observations, deterministic=True)[0], atol=1e-6)
+
+
+@pytest.mark.parametrize("ours", [OptionDDPG, OptionTD3])
+def test_the_saturation_penalty_is_the_mean_square_before_the_tanh(ours):
+    model = make(ours, [64, 64], policy_kwargs={"net_arch": [64, 64]}, saturation_penalty=0.1)
+    with th.no_grad():
+        model.actor.mu[-2].bias.fill_(2.0)
+    data = model.replay_buffer.sample(32)
+    settings = StepSettings(0.99, 0.0, 0.0, 0.0, 0.1)
+    fast = FastUpdate(model.policy)
+    gradients = []
+    fast.actor_adam.step = gradients.extend  # look at the gradients, learn nothing
+    fast.critic_adam.step = lambda _: None
+    fast.step(data, settings, with_actor=True)
+    before_tanh = model.actor.mu[:-1](data.observations)
+    actions = before_tanh.tanh()
+    loss = -model.critic.q1_forward(data.observations, actions).mean() + 0.1 * before_tanh.pow(2).sum(dim=1).mean()
+    expected = th.autograd.grad(loss, list(model.actor.mu.parameters()))
+    for gradient, theirs in zip(gradients, expected, strict=True):
+        np.testing.assert_allclose(gradient.numpy(), theirs.numpy(), atol=1e-6)

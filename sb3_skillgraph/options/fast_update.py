@@ -225,12 +225,14 @@ class StepSettings(NamedTuple):
     :param tau: SB3's soft update coefficient, 1 copies
     :param noise_std: standard deviation of the noise on the target's actions (TD3's smoothing)
     :param noise_clip: largest size of that noise
+    :param saturation_penalty: weight, in the actor's loss, of the mean square of what its tanh is given
     """
 
     gamma: float
     tau: float
     noise_std: float
     noise_clip: float
+    saturation_penalty: float
 
 
 class FastUpdate:
@@ -282,7 +284,7 @@ class FastUpdate:
                 return critic_loss, None
             # Target networks move towards the learned ones as soon as those are done, while they are in the cache.
             th._foreach_lerp_(self._critic_targets, self.critic_adam.parameters, settings.tau)
-            actor_loss = self._update_actor(inputs)
+            actor_loss = self._update_actor(inputs, settings.saturation_penalty)
             th._foreach_lerp_(self._actor_target, self.actor_adam.parameters, settings.tau)
             return critic_loss, actor_loss
 
@@ -300,15 +302,18 @@ class FastUpdate:
         self.critic_adam.step(gradients)
         return losses[0] if len(losses) == 1 else th.stack(losses).sum(), inputs
 
-    def _update_actor(self, inputs: th.Tensor) -> th.Tensor:
-        """Teach the actor to climb the first critic, overwriting the actions in ``inputs``; return its loss."""
+    def _update_actor(self, inputs: th.Tensor, saturation_penalty: float) -> th.Tensor:
+        """Teach the actor to climb the first critic, overwriting the actions in ``inputs``; return the loss of that."""
         critic = self.critics[0]
         start = self.actor.layers[0].weight.shape[1]
         values = self.actor.forward(inputs[:, :start])
+        penalty = values[-1] * (2 * saturation_penalty / len(inputs)) if saturation_penalty else None
         actions = values[-1].tanh_()
         inputs[:, start:] = actions
         critic_values = critic.forward(inputs)
         gradient = th.ops.aten.tanh_backward.default(critic.slope(critic_values, -1 / len(inputs), start), actions)
+        if penalty is not None:
+            gradient = gradient.add_(penalty)
         self.actor_adam.step(self.actor.parameter_gradients(values, gradient))
         return -critic_values[-1].mean()
 

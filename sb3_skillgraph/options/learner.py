@@ -36,6 +36,8 @@ class OptionLearner(TD3):
     :param env: the environment to learn from (if registered in Gym, can be str; None builds no environment)
     :param actor_learning_rate: Adam's learning rate for the actor
     :param critic_learning_rate: Adam's learning rate for the critics
+    :param saturation_penalty: weight, in the actor's loss, of the mean square of what its tanh is given: an actor that
+        an untrained critic has driven to the bounds of the actions finds its way back; 0 is SB3's loss
     :param kwargs: all other arguments of the SB3 class except ``learning_rate``, which these two replace
     """
 
@@ -48,10 +50,12 @@ class OptionLearner(TD3):
         *,
         actor_learning_rate: float = 1e-4,
         critic_learning_rate: float = 1e-3,
+        saturation_penalty: float = 0.0,
         **kwargs: Any,
     ) -> None:
         self.actor_learning_rate = actor_learning_rate
         self.critic_learning_rate = critic_learning_rate
+        self.saturation_penalty = saturation_penalty
         self._fast_update: FastUpdate | GraphedUpdate | None = None
         super().__init__(policy, env, learning_rate=critic_learning_rate, **kwargs)  # type: ignore[arg-type]
 
@@ -93,7 +97,9 @@ class OptionLearner(TD3):
         self, fast: FastUpdate | GraphedUpdate, gradient_steps: int, batch_size: int
     ) -> tuple[list[th.Tensor], list[th.Tensor]]:
         assert self.replay_buffer is not None
-        settings = StepSettings(self.gamma, self.tau, self.target_policy_noise, self.target_noise_clip)
+        settings = StepSettings(
+            self.gamma, self.tau, self.target_policy_noise, self.target_noise_clip, self.saturation_penalty
+        )
         actor_losses, critic_losses = [], []
         for _ in range(gradient_steps):
             self._n_updates += 1
@@ -110,7 +116,7 @@ class OptionLearner(TD3):
             return self._fast_update
         reason = why_not(self.policy)
         if reason is not None:
-            _warn_once(reason)
+            _warn_once(reason, bool(self.saturation_penalty))
             return None
         fast = FastUpdate(self.policy)
         self._fast_update = GraphedUpdate(fast) if self.device.type == "cuda" else fast
@@ -124,12 +130,15 @@ class OptionDDPG(OptionLearner, DDPG):
     """
     Deep Deterministic Policy Gradient for one option, with the paper's two learning rates (Table 1).
 
-    The same numbers as ``stable_baselines3.DDPG``, sooner where the networks are plain (``benchmarks/update.py``).
+    The same numbers as ``stable_baselines3.DDPG`` (unless given a penalty), sooner where the networks are plain
+    (``benchmarks/update.py``).
 
     :param policy: the policy model to use (MlpPolicy, CnnPolicy, ...)
     :param env: the environment to learn from (if registered in Gym, can be str; None builds no environment)
     :param actor_learning_rate: Adam's learning rate for the actor
     :param critic_learning_rate: Adam's learning rate for the critics
+    :param saturation_penalty: weight, in the actor's loss, of the mean square of what its tanh is given: an actor that
+        an untrained critic has driven to the bounds of the actions finds its way back; 0 is SB3's loss
     :param kwargs: all other arguments of ``stable_baselines3.DDPG`` except ``learning_rate``
     """
 
@@ -138,16 +147,20 @@ class OptionTD3(OptionLearner, TD3):
     """
     Twin Delayed DDPG for one option, with one learning rate for the actor and one for the critics.
 
-    The same numbers as ``stable_baselines3.TD3``, sooner where the networks are plain (``benchmarks/update.py``).
+    The same numbers as ``stable_baselines3.TD3`` (unless given a penalty), sooner where the networks are plain
+    (``benchmarks/update.py``).
 
     :param policy: the policy model to use (MlpPolicy, CnnPolicy, ...)
     :param env: the environment to learn from (if registered in Gym, can be str; None builds no environment)
     :param actor_learning_rate: Adam's learning rate for the actor
     :param critic_learning_rate: Adam's learning rate for the critics
+    :param saturation_penalty: weight, in the actor's loss, of the mean square of what its tanh is given: an actor that
+        an untrained critic has driven to the bounds of the actions finds its way back; 0 is SB3's loss
     :param kwargs: all other arguments of ``stable_baselines3.TD3`` except ``learning_rate``
     """
 
 
 @functools.cache
-def _warn_once(reason: str) -> None:
-    warnings.warn(f"Options train with SB3's own, slower update: {reason}.", stacklevel=4)
+def _warn_once(reason: str, penalised: bool) -> None:
+    update = "SB3's own, slower update, which has no saturation_penalty" if penalised else "SB3's own, slower update"
+    warnings.warn(f"Options train with {update}: {reason}.", stacklevel=4)
