@@ -82,10 +82,11 @@ class SkillGraphAgent(Assembly):
         it to learn that it has reached it; in event radii
     :param shared_experience: share of an option's batches drawn from all experience rather than its own runs
     :param salience: how events are proposed: ``"frontier"`` (visited states), ``"rrt"`` (uniform feasible states from
-        the environment's ``sample_free``) or an object with ``propose(rng)`` [3.2.1]
+        the environment's ``sample_free``), ``"dco"`` (the two ends of a learned Fiedler vector) or an object with
+        ``propose(rng)`` [3.2.1]
     :param salient_event_freq: K: episodes since the last accepted event after which new ones are sought [A.1.2]
     :param retry_after: R: episodes to wait after an attempt that yielded none [A.1.2]
-    :param events_per_attempt: events sought per attempt [A.1.2: a pair]
+    :param events_per_attempt: events sought per attempt [A.1.2: a pair]; None for 1, or 2 with ``"dco"``
     :param event_tries: proposals drawn per event until one is not redundant [A.1.1]
     :param event_reach: environment steps that a ``frontier`` event lies at most beyond the last event on its trajectory
     :param max_unconnected: no events are sought while the chains that join so many are still open; None for no limit
@@ -151,14 +152,14 @@ class SkillGraphAgent(Assembly):
         practice_runs: int = 2,
         warm_start: bool = True,
         global_update_fraction: float = 0.5,
-        saturation_penalty: float = 1e-3,
+        saturation_penalty: float = 1e-4,
         hindsight: float = 0.8,
         goal_tolerance: float = 0.5,
         shared_experience: float = 0.5,
-        salience: Literal["frontier", "rrt"] | Salience = "frontier",
+        salience: Literal["frontier", "rrt", "dco"] | Salience = "frontier",
         salient_event_freq: int = 30,
         retry_after: int = 1,
-        events_per_attempt: int = 1,
+        events_per_attempt: int | None = None,
         event_tries: int = 20,
         event_reach: int = 60,
         max_unconnected: int | None = 5,

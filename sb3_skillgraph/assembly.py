@@ -20,6 +20,7 @@ from sb3_skillgraph.persistence import Persistence
 from sb3_skillgraph.planner import GraphPlanner
 from sb3_skillgraph.pruning import Pruning
 from sb3_skillgraph.replay import TransitionStore
+from sb3_skillgraph.salience.dco import DCOSalience
 from sb3_skillgraph.salience.discovery import EventDiscovery
 from sb3_skillgraph.salience.proposals import FrontierSalience, RandomSalience, Salience
 from sb3_skillgraph.visited import VisitedStates
@@ -133,7 +134,7 @@ class Assembly(Persistence):
             self.event_radius,
             args["salient_event_freq"],
             args["retry_after"],
-            args["events_per_attempt"],
+            self._events_per_attempt(),
             args["event_tries"],
             args["max_unconnected"],
         )
@@ -151,15 +152,23 @@ class Assembly(Persistence):
             self.n_envs,
         )
 
+    def _events_per_attempt(self) -> int:
+        given = self._arguments["events_per_attempt"]
+        if given is not None:
+            return int(given)
+        return 2 if self._arguments["salience"] == "dco" else 1
+
     def _salience(self) -> Salience:
         salience = self._arguments["salience"]
         if salience == "frontier":
             return FrontierSalience(self.visited, 2.0 * self.event_radius, self._arguments["event_reach"])
+        if salience == "dco":
+            return DCOSalience(self.store, self.visited, self._arguments["event_reach"])
         if salience == "rrt":
             return RandomSalience(Oracle(self.get_env))
         if not hasattr(salience, "propose"):
             raise ValueError(
-                f"Unknown salience {salience!r}: use 'frontier', 'rrt' or an object with a method propose(rng) that "
+                f"Unknown salience {salience!r}: use 'frontier', 'rrt', 'dco' or an object with a method propose(rng) that "
                 "returns a point of goal space."
             )
         return salience

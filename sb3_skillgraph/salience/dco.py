@@ -1,0 +1,141 @@
+"""Salient events by deep covering options: the two ends of the explored space (sections 2.3, 3.2.1, A.1)."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.torch_layers import create_mlp
+
+from sb3_skillgraph.replay import TransitionStore
+from sb3_skillgraph.visited import VisitedStates
+
+
+class Sine(th.nn.Module):
+    """The sine as an activation function."""
+
+    def forward(self, inputs: th.Tensor) -> th.Tensor:
+        """:param inputs: any shape"""
+        return inputs.sin()
+
+
+class FiedlerEmbedding:
+    """A network that approximates the Fiedler vector of the graph that transitions span.
+
+    The Fiedler vector is the eigenvector of the graph's Laplacian with the second smallest eigenvalue: of all functions
+    with mean 0 and variance 1 the one that changes least along transitions. Wu et al. (2019,
+    https://arxiv.org/abs/1810.04586) find it by gradient descent (*graph drawing*), and Jinnai et al. (2020) use it for
+    deep covering options; with the constant as the first eigenvector their objective is ::
+
+        1/2 E[(f(s) - f(s'))^2] + penalty * ((E[f^2] - 1)^2 + 2 E[f]^2)
+
+    Across a wall the Fiedler vector jumps. The hidden units are sines, which can follow it there; ReLU and tanh networks
+    find the smoother second-best vector instead.
+
+    :param net_arch: units of the hidden layers
+    :param frequency: to which half side the explored box is scaled before the first sine; more follows thinner walls
+    :param learning_rate: of Adam at the beginning; it falls to 0
+    :param n_updates: gradient steps per fit
+    :param batch_size: transitions per step
+    :param penalty: weight of the constraints on mean and variance
+    """
+
+    def __init__(
+        self,
+        net_arch: Sequence[int] = (128, 128),
+        frequency: float = 10.0,
+        learning_rate: float = 1e-3,
+        n_updates: int = 1_000,
+        batch_size: int = 256,
+        penalty: float = 1.0,
+    ) -> None:
+        self.net_arch = list(net_arch)
+        self.frequency = frequency
+        self.learning_rate = learning_rate
+        self.n_updates = n_updates
+        self.batch_size = batch_size
+        self.penalty = penalty
+        self._net: th.nn.Module | None = None
+        self._center, self._scale = np.zeros(0), 1.0
+
+    def fit(self, points: np.ndarray, successors: np.ndarray, rng: np.random.Generator) -> "FiedlerEmbedding":
+        """Learn from transitions, from scratch.
+
+        :param points: where they begin, shape ``(n, goal_dim)``
+        :param successors: where they end, shape ``(n, goal_dim)``
+        :param rng: draws the initial weights and the minibatches
+        :return: the embedding itself
+        """
+        self._center = points.mean(axis=0)
+        self._scale = self.frequency / (float(np.abs(points - self._center).max()) or 1.0)
+        with th.random.fork_rng(devices=[]):  # learning elsewhere must not depend on whether this was called
+            th.manual_seed(int(rng.integers(2**31)))
+            self._net = th.nn.Sequential(*create_mlp(points.shape[1], 1, self.net_arch, Sine))
+        optimizer = th.optim.Adam(self._net.parameters(), lr=self.learning_rate, fused=True)
+        decay = th.optim.lr_scheduler.LinearLR(optimizer, 1.0, 0.0, self.n_updates)
+        pairs = th.stack([self._input(points), self._input(successors)])
+        for rows in rng.integers(0, len(points), (self.n_updates, self.batch_size)):
+            f, f_next = self._net(pairs[:, rows])
+            drawn = 0.5 * (f - f_next).pow(2).mean()
+            # Two halves of the batch make the squares of expectations unbiased.
+            (mean_a, mean_b), (square_a, square_b) = (x.view(2, -1).mean(dim=1) for x in (f, f.pow(2)))
+            loss = drawn + self.penalty * ((square_a - 1) * (square_b - 1) + 2 * mean_a * mean_b)
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+            decay.step()
+        return self
+
+    def __call__(self, points: np.ndarray) -> np.ndarray:
+        """Evaluate the embedding.
+
+        :param points: shape ``(n, goal_dim)``
+        :return: shape ``(n,)``; its sign is arbitrary
+        :raises ValueError: before :meth:`fit`
+        """
+        if self._net is None:
+            raise ValueError("The Fiedler embedding has learned nothing yet: call fit first.")
+        with th.no_grad():
+            return self._net(self._input(points)).numpy().ravel()
+
+    def _input(self, points: np.ndarray) -> th.Tensor:
+        return th.as_tensor((points - self._center) * self._scale, dtype=th.float32)
+
+
+class DCOSalience:
+    """The two visited states that are farthest apart in the graph of the agent's transitions (section 3.2.1, *DCO*).
+
+    Whenever there is new experience, a :class:`FiedlerEmbedding` is learned from scratch; where it is largest and where
+    it is smallest are proposed, one after the other. Pairs of states some steps apart on one trajectory, instead of
+    neighbours, make the slowest direction stand out (Wu et al. 2019, multi-step transitions).
+
+    :param store: the agent's transitions
+    :param visited: the agent's trajectories: events lie on visited states
+    :param reach: environment steps that a pair lies at most apart
+    :param n_pairs: pairs that an embedding is learned from
+    """
+
+    def __init__(self, store: TransitionStore, visited: VisitedStates, reach: int, n_pairs: int = 20_000) -> None:
+        self.store = store
+        self.visited = visited
+        self.reach = reach
+        self.n_pairs = n_pairs
+        self._candidates: list[np.ndarray] = []
+        self._learned_from = 0  # transitions
+
+    def propose(self, rng: np.random.Generator) -> np.ndarray | None:
+        """Propose one end of the explored space, then the other; None until there is new experience."""
+        if self.store.total > self._learned_from and len(self.store) and self.visited.size:
+            self._learned_from = self.store.total
+            values = self.embed(rng)(self.visited.points)
+            self._candidates = [self.visited.points[i].astype(np.float64) for i in (values.argmin(), values.argmax())]
+        return self._candidates.pop() if self._candidates else None
+
+    def embed(self, rng: np.random.Generator) -> FiedlerEmbedding:
+        """Learn the embedding of the present experience.
+
+        :param rng: random generator
+        """
+        rows = rng.integers(self.store.oldest, self.store.total, self.n_pairs)
+        later = self.store.future(rows, self.reach, rng)
+        points, successors = self.store.column("achieved_goal", rows), self.store.column("next_achieved_goal", later)
+        return FiedlerEmbedding().fit(points, successors, rng)
