@@ -38,7 +38,15 @@ _COUNTERS = ("num_timesteps", "_total_timesteps", "_num_timesteps_at_start", "_e
 
 
 class OptionList(list[Option]):
-    """Options in the order of their making; one can also be found by its id, as an item or as an attribute."""
+    """Options in the order of their making; one can also be found by its id, as an item or as an attribute.
+
+    :param options: all but the global one
+    :param global_option: the one that walks straight to any goal; it is not in the list
+    """
+
+    def __init__(self, options: Iterable[Option], global_option: Option) -> None:
+        super().__init__(options)
+        self.global_option = global_option
 
     def __getitem__(self, key: Any) -> Any:
         return self._by_id(key) if isinstance(key, str) else super().__getitem__(key)
@@ -84,7 +92,7 @@ class Persistence(OffPolicyAlgorithm):
     @property
     def options(self) -> OptionList:
         """All options but the global one, in the order of their making."""
-        return OptionList(self.chaining.options.values())
+        return OptionList(self.chaining.options.values(), self.global_option)
 
     # -- saving -------------------------------------------------------------------------------------------------------
 

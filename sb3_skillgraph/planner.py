@@ -141,6 +141,16 @@ class GraphPlanner:
             return -1
         return self.visited.waypoint(point, goal, 0.5 * self.radius, self.reach // (6 if failures else 3))
 
+    def route(self, point: np.ndarray, goal: np.ndarray) -> np.ndarray:
+        """Return where the global option should go first on its way to a goal (see :meth:`waypoint`).
+
+        :param point: where the agent stands, shape ``(goal_dim,)``
+        :param goal: shape ``(goal_dim,)``
+        :return: a visited point, or the goal itself
+        """
+        waypoint = self.waypoint(point, goal, 0)
+        return goal if waypoint < 0 else self.visited.point(waypoint)
+
     def near_in_steps(self, point: np.ndarray, goal: np.ndarray) -> bool:
         """Tell whether a trajectory went from a point to another in no more steps than three options take."""
         return self.visited.steps_between(point, goal, 0.5 * self.radius) <= 3 * self.reach

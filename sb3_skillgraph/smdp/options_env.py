@@ -1,0 +1,226 @@
+"""A goal environment lifted into an SMDP: one action is one run of an option (section 2.1)."""
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+
+from sb3_skillgraph.options.execution import Fate, fate
+from sb3_skillgraph.options.option import Option
+from sb3_skillgraph.options.views import VIEWS, ScaledView
+
+MASK = "action_mask"
+Route = Callable[[np.ndarray, np.ndarray], np.ndarray]
+
+
+class _Run(NamedTuple):
+    """One action while it is being executed.
+
+    :param id: the option's id, or ``primitive 0``, ...
+    :param option: whose policy acts; None for a primitive action
+    :param action: the primitive action, scaled to [-1, 1]
+    :param aim: where the option is to go, shape ``(goal_dim,)``
+    :param reached: whether it has got there, given where the agent stands
+    :param timeout: environment steps it may take
+    """
+
+    id: str
+    option: Option | None
+    action: np.ndarray | None
+    aim: np.ndarray
+    reached: Callable[[np.ndarray], bool]
+    timeout: int
+
+
+class OptionsEnv(gym.Wrapper):
+    """
+    An environment whose actions are options.
+
+    Action ``i`` runs ``options[i]`` until it reaches its termination set, times out or the episode ends. The last actions
+    can always be taken: the global option, which walks to the goal, then primitive actions, which take one step. The
+    reward is the discounted sum of the rewards on the way, and ``info`` has ``tau`` (environment steps taken), ``discount``
+    (``gamma ** tau``), ``option`` (id) and ``option_success``.
+
+    Observations gain an entry ``action_mask``, which :meth:`action_masks` returns as well: an option may run if it is
+    mature, stands in its (optimistic) initiation set and not yet in its termination set. Options may be appended to the
+    list at any time; actions of those still unborn are masked.
+
+    :param env: a goal environment (Dict observations, Box actions)
+    :param options: options, such as ``agent.options``, which knows the agent's global option
+    :param global_option: walks straight to any goal; by default the one that ``options`` knows
+    :param primitives: actions scaled to [-1, 1], shape ``(n, action_dim)``; None takes both directions of every axis and
+        standing still where actions have at most two dimensions, else one step of the global option's policy
+    :param max_options: number of actions: room for options and primitive actions
+    :param gamma: discount factor per environment step
+    :param timeout: environment steps an option may run; the global option, half of them
+    :param view: what the options' policies see; by default what the environment names in ``option_view``
+    :param route: tells, given where the agent stands and its goal, where the global option is to go first; by default
+        straight to the goal
+    :raises ValueError: if the environment is no goal environment, there is no global option, or not enough room
+    """
+
+    def __init__(
+        self,
+        env: gym.Env,
+        options: Sequence[Option],
+        *,
+        global_option: Option | None = None,
+        primitives: np.ndarray | None = None,
+        max_options: int = 64,
+        gamma: float = 0.99,
+        timeout: int = 200,
+        view: ScaledView | None = None,
+        route: Route | None = None,
+    ) -> None:
+        super().__init__(env)
+        inner = env.observation_space
+        if not isinstance(inner, spaces.Dict) or "desired_goal" not in inner.spaces:
+            raise ValueError(f"OptionsEnv needs a goal environment with Dict observations, not {inner}.")
+        if not isinstance(env.action_space, spaces.Box):
+            raise ValueError(f"OptionsEnv needs an environment with Box actions, not {env.action_space}.")
+        self.options = options
+        self.gamma = gamma
+        self.timeout = timeout
+        self.route = route
+        self.global_option = self._find_global(global_option)
+        self.primitives = self._find_primitives(env.action_space, primitives)
+        name = env.get_wrapper_attr("option_view") if env.has_wrapper_attr("option_view") else "relative"
+        self.view = view or ScaledView(VIEWS[name], self.global_option.radius)
+        self.max_options = max_options
+        self.action_space = spaces.Discrete(max_options)
+        self.observation_space = spaces.Dict({**inner.spaces, MASK: spaces.MultiBinary(max_options)})
+        self._inner_space = env.action_space
+        self._last: dict[str, np.ndarray] | None = None
+        self._check_room()
+
+    def _find_global(self, given: Option | None) -> Option:
+        found = given or getattr(self.options, "global_option", None)
+        if found is None:
+            raise ValueError(
+                "OptionsEnv needs a global option, lest there be places where no option can run: give "
+                "global_option=agent.global_option."
+            )
+        return found
+
+    def _find_primitives(self, space: spaces.Box, given: np.ndarray | None) -> list[np.ndarray | None]:
+        dim = int(np.prod(space.shape))
+        if given is not None:
+            return list(np.asarray(given, dtype=np.float32).reshape(-1, dim))
+        if dim > 2:
+            return [None]  # a step of the global policy
+        axes = np.eye(dim, dtype=np.float32)
+        return [*axes, *-axes, np.zeros(dim, dtype=np.float32)]
+
+    def _check_room(self) -> None:
+        if len(self.options) > self.global_action:
+            needed = len(self.options) + 1 + len(self.primitives)
+            raise ValueError(
+                f"{len(self.options)} options, the global option and {len(self.primitives)} primitive actions are {needed} "
+                f"actions, but max_options is {self.max_options}: give max_options={2 ** math.ceil(math.log2(needed))}."
+            )
+
+    @property
+    def global_action(self) -> int:
+        """Index of the global option; primitive actions follow."""
+        return self.max_options - len(self.primitives) - 1
+
+    def index(self, option: str) -> int:
+        """Return an option's action.
+
+        :param option: its id
+        :raises KeyError: if there is none of that name
+        """
+        for i, candidate in enumerate(self.options):
+            if candidate.id == option:
+                return i
+        raise KeyError(option)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """Begin an episode.
+
+        :param seed: seeds the wrapped environment
+        :param options: passed to the wrapped environment
+        :return: observation and info
+        """
+        observation, info = self.env.reset(seed=seed, options=options)
+        return self._see(observation), info
+
+    def action_masks(self) -> np.ndarray:
+        """Tell which actions can be taken now, under sb3-contrib's name for it.
+
+        :return: bool array of shape ``(max_options,)``, never all False
+        :raises ValueError: before the first ``reset``, or if the options have outgrown ``max_options``
+        """
+        if self._last is None:
+            raise ValueError("Call reset before action_masks: which options can start depends on where the agent stands.")
+        self._check_room()
+        point = np.asarray(self._last["achieved_goal"])
+        mask = np.zeros(self.max_options, dtype=bool)
+        mask[: len(self.options)] = [self._can_run(option, point) for option in self.options]
+        mask[self.global_action :] = True
+        return mask
+
+    def _can_run(self, option: Option, point: np.ndarray) -> bool:
+        return option.mature and bool(option.initiation.optimistic(point[None])[0]) and not option.terminates(point)
+
+    def step(self, action: int | np.ndarray) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
+        """Run an option.
+
+        :param action: its index
+        :return: observation, discounted sum of rewards, terminated, truncated, info
+        :raises ValueError: if the action is masked
+        """
+        run = self._begin(int(action))
+        total, discount, tau = 0.0, 1.0, 0
+        while True:
+            observation, reward, terminated, truncated, info = self.env.step(self._act(run))
+            self._last = observation
+            total += discount * float(reward)
+            discount *= self.gamma
+            tau += 1
+            what = fate(run.reached(np.asarray(observation["achieved_goal"])), tau, run.timeout)
+            if what != Fate.RUNNING or terminated or truncated:
+                break
+        info = {**info, "tau": tau, "discount": discount, "option": run.id, "option_success": what == Fate.SUCCEEDED}
+        return self._see(observation), total, terminated, truncated, info
+
+    def _begin(self, action: int) -> _Run:
+        if not self.action_masks()[action]:
+            raise ValueError(f"Action {action} cannot be taken here: see action_masks().")
+        assert self._last is not None
+        point, goal = np.asarray(self._last["achieved_goal"]), np.asarray(self._last["desired_goal"])
+        if action < self.global_action:
+            option = self.options[action]
+            return _Run(option.id, option, None, option.subgoal, option.terminates, self.timeout)
+        if action > self.global_action:
+            index = action - self.global_action - 1
+            primitive = self.primitives[index]
+            acts = self.global_option if primitive is None else None
+            return _Run(f"primitive {index}", acts, primitive, goal, lambda point: True, 1)
+        aim, radius = goal, self.global_option.radius
+        if self.route is not None:
+            aim = self.route(point, goal)
+            radius = radius if aim is goal else 0.5 * radius
+        reached = lambda point: math.dist(point, aim) <= radius  # noqa: E731
+        return _Run(self.global_option.id, self.global_option, None, aim, reached, self.timeout // 2)
+
+    def _act(self, run: _Run) -> np.ndarray:
+        assert self._last is not None
+        scaled = run.action
+        if run.option is not None:
+            observation, point = (
+                np.asarray(self._last[key], dtype=np.float32).reshape(1, -1) for key in ("observation", "achieved_goal")
+            )
+            scaled = run.option.actor.act(self.view(observation, point, run.aim[None].astype(np.float32)))[0]
+        assert scaled is not None
+        low, high = self._inner_space.low, self._inner_space.high
+        return (low + 0.5 * (scaled.reshape(low.shape) + 1.0) * (high - low)).astype(self._inner_space.dtype)
+
+    def _see(self, observation: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        self._last = observation
+        return {**observation, MASK: self.action_masks().astype(np.int8)}

@@ -1,0 +1,328 @@
+"""Options as actions: the lifted environment, planning and Q-learning on it."""
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from builders import make_option
+from conftest import TOY, new_agent
+from gymnasium import spaces
+from sb3_contrib import MaskablePPO
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+from sb3_skillgraph import GraphPolicy, OptionsEnv, SkillGraphAgent, SMDPQLearning
+from sb3_skillgraph.events import SalientEvent
+from sb3_skillgraph.options.option import Option
+
+GAMMA = 0.9
+
+
+@pytest.fixture(scope="module")
+def agent() -> SkillGraphAgent:
+    return new_agent().learn(2_500)
+
+
+def lifted(agent: SkillGraphAgent, **kwargs: Any) -> OptionsEnv:
+    env = gym.make(TOY, terminate_on_success=True, max_steps=200)
+    return OptionsEnv(env, agent.options, **{"gamma": GAMMA, "view": agent.view, **kwargs})
+
+
+def reset_somewhere(env: OptionsEnv, rng: np.random.Generator) -> dict[str, np.ndarray]:
+    sample = env.get_wrapper_attr("sample_free")
+    return env.reset(options={"start": sample(rng), "goal": sample(rng)})[0]
+
+
+# -- the environment --------------------------------------------------------------------------------------------------
+
+
+class Steps(gym.Wrapper):
+    """Notes the rewards of the wrapped environment."""
+
+    rewards: list[float]
+
+    def step(self, action: Any) -> Any:
+        result = self.env.step(action)
+        self.rewards.append(float(result[1]) + 1.0)  # lest most of them be 0
+        return (result[0], self.rewards[-1], *result[2:])
+
+
+def test_one_action_is_one_run_of_an_option(agent: SkillGraphAgent) -> None:
+    steps = Steps(gym.make(TOY, max_steps=150))
+    env = OptionsEnv(steps, agent.options, gamma=GAMMA, view=agent.view)
+    assert env.action_space == spaces.Discrete(64)
+    rng, ran = np.random.default_rng(0), set()
+    for _ in range(15):
+        observation, over = reset_somewhere(env, rng), False
+        while not over:
+            assert observation in env.observation_space
+            mask = env.action_masks()
+            np.testing.assert_array_equal(mask, observation["action_mask"])
+            action = int(rng.choice(np.flatnonzero(mask)))
+            start, steps.rewards = observation["achieved_goal"], []
+            observation, reward, terminated, truncated, info = env.step(action)
+            over = terminated or truncated
+            assert info["tau"] == len(steps.rewards) >= 1
+            assert info["discount"] == pytest.approx(GAMMA ** info["tau"])
+            assert reward == pytest.approx(sum(GAMMA**t * r for t, r in enumerate(steps.rewards)))
+            ran.add(info["option"])
+            if action < len(env.options):
+                option = env.options[action]
+                assert info["option"] == option.id == agent.options[option.id].id
+                assert option.initiation.optimistic(start[None])[0]
+                assert info["tau"] <= env.timeout
+                assert info["option_success"] == option.terminates(observation["achieved_goal"])
+    assert {"global", "primitive 0", "primitive 4"} <= ran
+    assert any(id.startswith("o") for id in ran)
+
+
+def test_what_cannot_run_is_masked(agent: SkillGraphAgent) -> None:
+    event = SalientEvent("e0", np.array([1.0, 1.0]), 0.45)
+    options = [
+        make_option("o1", "e0", event, start=((-1.0, 1.0), 0.5)),
+        make_option("o2", "e0", event),  # gestates
+        make_option("o3", "e0", event, start=((1.0, 1.0), 0.5)),  # ends where it starts
+    ]
+    env = OptionsEnv(gym.make(TOY), options, global_option=agent.global_option, max_options=16)
+    with pytest.raises(ValueError, match="Call reset"):
+        env.action_masks()
+    always = np.arange(16) >= 10
+    env.reset(options={"start": [-1.0, 1.0]})
+    np.testing.assert_array_equal(env.action_masks(), always | (np.arange(16) == 0))
+    env.reset(options={"start": [1.0, 1.0]})
+    np.testing.assert_array_equal(env.action_masks(), always)
+    with pytest.raises(ValueError, match="Action 1 cannot be taken here"):
+        env.step(1)
+    options.append(make_option("o4", "e0", event, start=((1.0, -1.0), 0.5)))  # born meanwhile
+    env.reset(options={"start": [1.0, -1.0]})
+    assert env.action_masks()[3]
+    assert env.index("o4") == 3
+    with pytest.raises(KeyError):
+        env.index("o5")
+
+
+def test_primitive_actions(agent: SkillGraphAgent) -> None:
+    env = lifted(agent)
+    assert len(env.primitives) == 5  # both directions of both axes, and standing still
+    start = np.array([-1.0, 1.0])
+    for i, move in enumerate([(1, 0), (0, 1), (-1, 0), (0, -1), (0, 0)]):
+        env.reset(options={"start": start, "goal": [1.0, -1.0]})
+        observation, _, _, _, info = env.step(env.global_action + 1 + i)
+        np.testing.assert_allclose(observation["achieved_goal"] - start, 0.25 * np.array(move))
+        assert (info["option"], info["tau"]) == (f"primitive {i}", 1)
+    own = lifted(agent, primitives=np.array([[0.5, -0.5]]), max_options=len(agent.options) + 2)
+    own.reset(options={"start": start})
+    np.testing.assert_allclose(own.step(own.max_options - 1)[0]["achieved_goal"] - start, [0.125, -0.125])
+
+
+def test_one_step_of_the_global_policy_where_actions_have_many_dimensions(agent: SkillGraphAgent) -> None:
+    class Legs(gym.ActionWrapper):
+        """Eight numbers, the first two of which move."""
+
+        action_space = spaces.Box(-1.0, 1.0, (8,), np.float32)
+
+        def action(self, action: np.ndarray) -> np.ndarray:
+            return action[:2]
+
+    class Eastward:
+        def act(self, seen: np.ndarray) -> np.ndarray:
+            return np.tile([1.0, 0, 0, 0, 0, 0, 0, 0], (len(seen), 1))
+
+    walker = make_option("global", None, None)
+    walker._actor = Eastward()  # type: ignore[assignment]
+    env = OptionsEnv(Legs(gym.make(TOY)), [], global_option=walker, max_options=8)
+    assert len(env.primitives) == 1
+    env.reset(options={"start": [-1.0, 1.0]})
+    observation, _, _, _, info = env.step(7)
+    np.testing.assert_allclose(observation["achieved_goal"], [-0.75, 1.0])
+    assert info["tau"] == 1
+
+
+def test_the_global_option_walks_to_the_goal_or_along_a_route(agent: SkillGraphAgent) -> None:
+    env = lifted(agent)
+    env.reset(options={"start": [-1.0, 1.0], "goal": [-1.0, 1.0 - 0.3]})
+    _, reward, terminated, _, info = env.step(env.global_action)
+    assert terminated
+    assert info["option_success"]
+    assert (info["tau"], reward) == (1, 1.0)
+    asked = []
+
+    def route(point: np.ndarray, goal: np.ndarray) -> np.ndarray:
+        asked.append((point.tolist(), goal.tolist()))
+        return np.array([0.0, 1.0])
+
+    env = lifted(agent, route=route)
+    env.reset(options={"start": [-1.0, 1.0], "goal": [1.0, -1.0]})
+    observation, _, _, _, info = env.step(env.global_action)
+    assert asked == [([-1.0, 1.0], [1.0, -1.0])]
+    assert info["tau"] <= env.timeout // 2
+    if info["option_success"]:
+        assert np.linalg.norm(observation["achieved_goal"] - [0.0, 1.0]) <= 0.5 * agent.event_radius
+
+
+def test_what_it_refuses(agent: SkillGraphAgent) -> None:
+    with pytest.raises(ValueError, match="needs a goal environment"):
+        OptionsEnv(gym.make("CartPole-v1"), agent.options)
+    with pytest.raises(ValueError, match=r"global_option=agent\.global_option"):
+        OptionsEnv(gym.make(TOY), [])
+    many: list[Option] = [agent.global_option] * 11
+    with pytest.raises(ValueError, match=r"are 17 actions, but max_options is 16: give max_options=32"):
+        OptionsEnv(gym.make(TOY), many, global_option=agent.global_option, max_options=16)
+
+
+def test_monitor_counts_decisions_and_seeds_repeat(agent: SkillGraphAgent) -> None:
+    def play(seed: int) -> list[Any]:
+        env, rng = Monitor(lifted(agent)), np.random.default_rng(seed)
+        observation, _ = env.reset(seed=seed)
+        path, over, info = [observation["achieved_goal"].tolist()], False, {}
+        while not over:
+            action = int(rng.choice(np.flatnonzero(observation["action_mask"])))
+            observation, _, terminated, truncated, info = env.step(action)
+            path.append(observation["achieved_goal"].tolist())
+            over = terminated or truncated
+        assert info["episode"]["l"] == len(path) - 1
+        return path
+
+    assert play(1) == play(1) != play(2)
+
+
+# -- two high levels --------------------------------------------------------------------------------------------------
+
+
+def test_the_graph_plans_on_it(agent: SkillGraphAgent) -> None:
+    env = lifted(agent, route=agent.planner.route)
+    policy = GraphPolicy(agent.planner, env)
+    rewards, lengths = evaluate_policy(policy, Monitor(env), n_eval_episodes=20, return_episode_rewards=True)  # type: ignore[arg-type]
+    assert len(rewards) == len(lengths) == 20
+    successes = np.array(rewards) > 0
+    agent.planning = False
+    straight, _ = evaluate_policy(agent, Monitor(env.env), n_eval_episodes=20, return_episode_rewards=True)
+    agent.planning = True
+    assert successes.mean() >= max(0.5, np.mean(np.array(straight) > 0) - 0.1)
+
+
+def test_the_graph_remembers_failures_for_each_environment(agent: SkillGraphAgent) -> None:
+    env = lifted(agent, route=agent.planner.route)
+    policy = GraphPolicy(agent.planner, env)
+    one = reset_somewhere(env, np.random.default_rng(0))
+    batch = {key: np.stack([value, value]) for key, value in one.items()}
+    alone, state = policy.predict(one)
+    both, states = policy.predict(batch)
+    assert alone.shape == ()
+    assert both.tolist() == [alone, alone]
+    assert state is not None
+    assert states is not None
+    assert [x.shape for x in states] == [(2,)] * 3
+    again = policy.predict(batch, states, np.array([True, False]))[1]
+    assert again is not None
+    fresh, kept = np.array(again).T
+    assert fresh.tolist() == np.array(state).ravel().tolist()
+    assert kept.tolist() != fresh.tolist()  # it got nowhere, and knows
+
+
+class SmallSMDP(gym.Env):
+    """Four states in a row, the last one the end: walk on in 1 step, or leap over one in 5; resting pays a little.
+
+    Leaping cannot be done from the state before the end.
+    """
+
+    WALK, LEAP, REST = range(3)
+
+    def __init__(self) -> None:
+        self.observation_space = spaces.Dict(
+            {"observation": spaces.Box(0.0, 1.0, (4,), np.float32), "action_mask": spaces.MultiBinary(3)}
+        )
+        self.action_space = spaces.Discrete(3)
+        self.state = 0
+
+    @classmethod
+    def model(cls, state: int, action: int) -> tuple[int, float, int]:
+        """Return the next state, the reward and how long it takes."""
+        after = {cls.WALK: state + 1, cls.LEAP: state + 2, cls.REST: state}[action]
+        reward = {cls.WALK: -1.0, cls.LEAP: -0.5, cls.REST: 0.05}[action] + 3.0 * (after == 3)
+        return after, reward, {cls.WALK: 1, cls.LEAP: 5, cls.REST: 2}[action]
+
+    def see(self) -> dict[str, np.ndarray]:
+        mask = np.array([1, self.state < 2, 1], dtype=np.int8)
+        return {"observation": np.eye(4, dtype=np.float32)[self.state], "action_mask": mask}
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict[str, np.ndarray], Any]:
+        super().reset(seed=seed)
+        self.state = int(self.np_random.integers(3))
+        return self.see(), {}
+
+    def step(self, action: Any) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
+        assert self.see()["action_mask"][int(action)], "a masked action was taken"
+        self.state, reward, tau = self.model(self.state, int(action))
+        return self.see(), reward, self.state == 3, False, {"tau": tau, "discount": GAMMA**tau}
+
+
+def exact() -> np.ndarray:
+    """Return the optimal values of the small SMDP, shape (3, 3); minus infinity where an action is masked."""
+    q = np.zeros((4, 3))
+    for _ in range(500):
+        values = np.append(np.where(np.arange(3)[:, None] + np.array([0, 1, 0]) < 3, q[:3], -np.inf).max(axis=1), 0.0)
+        for state in range(3):
+            for action in range(3):
+                if action != SmallSMDP.LEAP or state < 2:
+                    after, reward, tau = SmallSMDP.model(state, action)
+                    q[state, action] = reward + GAMMA**tau * values[after]
+    q[2, SmallSMDP.LEAP] = -np.inf
+    return q[:3]
+
+
+@pytest.mark.parametrize("n_envs", [1, 2])
+def test_q_learning_finds_the_values_of_a_small_smdp(n_envs: int) -> None:
+    env = DummyVecEnv([SmallSMDP for _ in range(n_envs)])
+    model = SMDPQLearning(
+        "MultiInputPolicy",
+        env,
+        learning_rate=lambda left: 0.05 * left,
+        learning_starts=100,
+        train_freq=1,
+        batch_size=64,
+        gamma=GAMMA,
+        target_update_interval=20,
+        exploration_initial_eps=1.0,
+        exploration_final_eps=1.0,
+        policy_kwargs={"net_arch": []},  # linear in a one-hot state: a table
+        seed=0,
+    ).learn(2_500 * n_envs)
+    states = {"observation": np.eye(4, dtype=np.float32)[:3], "action_mask": np.array([[1, 1, 1], [1, 1, 1], [1, 0, 1]])}
+    with th.no_grad():
+        values = model.q_net({key: th.as_tensor(value) for key, value in states.items()}).numpy()
+    np.testing.assert_allclose(values, exact(), atol=0.02)
+    actions, _ = model.predict(states, deterministic=True)
+    assert actions.tolist() == exact().argmax(axis=1).tolist()
+
+
+def test_q_learning_learns_on_options_and_is_saved(agent: SkillGraphAgent, tmp_path: Any) -> None:
+    env = Monitor(lifted(agent))
+    model = SMDPQLearning("MultiInputPolicy", env, learning_starts=50, train_freq=1, gamma=GAMMA, seed=0).learn(300)
+    assert model._n_updates > 200
+    assert (model.replay_buffer.discounts[:300] < GAMMA + 1e-6).all()  # type: ignore[union-attr]
+    assert len(np.unique(model.replay_buffer.discounts[:300])) > 2  # type: ignore[union-attr]
+    evaluate_policy(model, env, n_eval_episodes=3)
+    model.save(tmp_path / "q")
+    loaded = SMDPQLearning.load(tmp_path / "q", env=env)
+    observation = env.reset(seed=0)[0]
+    assert loaded.predict(observation, deterministic=True)[0] == model.predict(observation, deterministic=True)[0]
+    loaded.learn(60, reset_num_timesteps=False)
+
+
+def test_q_learning_without_masks_and_what_it_refuses() -> None:
+    model = SMDPQLearning("MlpPolicy", "CartPole-v1", learning_starts=50, seed=0).learn(120)
+    assert (model.replay_buffer.discounts == np.float32(model.gamma)).all()  # type: ignore[union-attr]
+    with pytest.raises(ValueError, match="n_steps must be 1"):
+        SMDPQLearning("MlpPolicy", "CartPole-v1", n_steps=3)
+
+
+def test_maskable_ppo_trains_on_it(agent: SkillGraphAgent) -> None:
+    env = Monitor(lifted(agent))
+    model = MaskablePPO("MultiInputPolicy", env, n_steps=64, batch_size=32, n_epochs=2, seed=0).learn(128)
+    observation, _ = env.reset(seed=0)
+    action, _ = model.predict(observation, action_masks=env.get_wrapper_attr("action_masks")())
+    assert observation["action_mask"][int(action)]
