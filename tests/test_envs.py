@@ -29,7 +29,8 @@ IDS = [
     ANT,
     "SkillGraph/AntReacher-v0",
 ]
-BODIES = [TOY, POINT, ANT]
+CAR = "car"  # the point maze with the paper's robot
+BODIES = [TOY, POINT, CAR, ANT]
 # A non-square maze with a dead end, an "r" that is not the first free cell, and two rooms that touch at a corner only.
 ODD_MAZE: envs.MazeMap = [
     [1, 1, 1, 1, 1, 1, 1],
@@ -51,6 +52,8 @@ GEOMETRIES = {name: envs.MazeGeometry(maze_map) for name, maze_map in MAZES.item
 
 
 def make(env_id: str, **kwargs: Any) -> gym.Env:
+    if env_id == CAR:
+        return gym.make(POINT, robot="car", **kwargs)
     if env_id.endswith("PointMaze-v0"):
         kwargs.setdefault("maze_map", ODD_MAZE)
     return gym.make(env_id, **kwargs)
@@ -245,7 +248,7 @@ def test_samples_are_uniform_over_the_free_area():
 # --- all environments
 
 
-@pytest.mark.parametrize("env_id", IDS)
+@pytest.mark.parametrize("env_id", [*IDS, CAR])
 def test_makes_resets_steps_and_passes_the_check(env_id):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -308,7 +311,7 @@ def test_the_goal_is_copied_from_the_options_and_into_the_observation():
     np.testing.assert_array_equal(observation["desired_goal"], [1.0, 1.0])
 
 
-@pytest.mark.parametrize("env_id", [POINT, ANT])
+@pytest.mark.parametrize("env_id", [POINT, CAR, ANT])
 def test_the_goal_mark_moves_in_the_model(env_id):
     env = make(env_id)
     task = env.unwrapped
@@ -611,3 +614,40 @@ def test_the_toy_draws_itself():
     at = {name: tuple(image[int((2.5 - y) * 32), int((x + 2.5) * 32)]) for name, (x, y) in drawn.items()}
     assert len(set(at.values())) == 4
     assert make(TOY).unwrapped.render() is None
+
+
+# --- the car
+
+
+def test_the_car_turns_then_drives_along_its_heading():
+    env = make(CAR)
+    task = env.unwrapped
+    assert (task.geometry.cell_size, task.success_radius) == (3.0, 0.6)
+    assert env.observation_space["observation"].shape == (6,)
+    start = task.geometry.cell_to_xy(3, 3)
+    env.reset(options={"start": start})
+    observation = env.step(np.array([0.5, 1.0], dtype=np.float32))[0]["observation"]
+    np.testing.assert_allclose(observation[:3], [*(start + 0.5 * np.array([np.cos(0.25), np.sin(0.25)])), 0.25])
+    np.testing.assert_allclose(observation[3:] * 0.05, observation[:3] - [*start, 0.0])
+    for _ in range(20):
+        heading = env.step(np.array([0.0, 1.0], dtype=np.float32))[0]["observation"][2]
+    assert heading == pytest.approx(21 * 0.25 - 2 * np.pi)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_the_car_stays_out_of_the_walls_but_turns_beside_them(seed):
+    env, rng = make(CAR), np.random.default_rng(seed)
+    env.reset(seed=seed)
+    points = []
+    for _ in range(600):
+        observation = env.step(np.array([rng.uniform(-1, 1), rng.uniform(-1, 1)], dtype=np.float32))[0]["observation"]
+        points.append(observation[:2])
+    assert env.unwrapped.geometry.is_free(np.array(points), 0.39).all()
+    stuck = np.flatnonzero((np.diff(points, axis=0) == 0).all(axis=1))
+    assert len(stuck) > 5
+    assert len(np.unique(np.round(points, 1), axis=0)) > 50
+
+
+def test_an_unknown_robot():
+    with pytest.raises(ValueError, match="unknown robot 'truck': use 'ball' or 'car'"):
+        gym.make(POINT, robot="truck")

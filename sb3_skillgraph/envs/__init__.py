@@ -21,7 +21,7 @@ __all__ = [
 ]
 
 # Entry points are names: MuJoCo is imported when an environment that needs it is made.
-_POINT = "sb3_skillgraph.envs.mujoco_mazes:PointMazeEnv"
+_POINT = "sb3_skillgraph.envs.point_mazes:make_point_maze"
 _ANT = "sb3_skillgraph.envs.mujoco_mazes:AntMazeEnv"
 _TOY = "sb3_skillgraph.envs.toy:ToyMazeEnv"
 _TASKS: dict[str, tuple[str, dict[str, Any]]] = {

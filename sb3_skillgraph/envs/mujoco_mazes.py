@@ -29,7 +29,7 @@ _temporary_directory_lock = threading.Lock()
 
 
 @contextlib.contextmanager
-def _private_temporary_directory() -> Iterator[None]:
+def private_temporary_directory() -> Iterator[None]:
     """Make the temporary files of the block vanish at its end.
 
     gymnasium-robotics 1.4.2 writes the model to a file named after the clock and leaves it there. In a directory of its
@@ -43,10 +43,10 @@ def _private_temporary_directory() -> Iterator[None]:
             tempfile.tempdir = before
 
 
-class _MujocoMazeTask(GoalTask, EzPickle):
+class MujocoMazeTask(GoalTask, EzPickle):
     """What the MuJoCo mazes share; comes before a maze environment of gymnasium-robotics in the list of bases."""
 
-    #: Moves the mark of the goal in the model; supplied by gymnasium-robotics.
+    #: Moves the mark of the goal in the model.
     update_target_site_pos: Callable[[], None]
 
     @property
@@ -83,7 +83,7 @@ class _MujocoMazeTask(GoalTask, EzPickle):
         self.set_state(state["task_state"])
 
 
-class PointMazeEnv(_MujocoMazeTask, point_maze.PointMazeEnv):
+class PointMazeEnv(MujocoMazeTask, point_maze.PointMazeEnv):
     """A ball pushed by forces in a maze of cells of 1 m.
 
     Body, model and spaces are those of gymnasium-robotics' ``PointMaze-v3``: the observation is (x, y, vx, vy), the
@@ -114,8 +114,8 @@ class PointMazeEnv(_MujocoMazeTask, point_maze.PointMazeEnv):
         max_steps: int = 1000,
         terminate_on_success: bool = False,
     ) -> None:
-        geometry = _make_geometry(maze_map, _POINT_CELL_SIZE)
-        with _private_temporary_directory():
+        geometry = make_geometry(maze_map, _POINT_CELL_SIZE)
+        with private_temporary_directory():
             super().__init__(maze_map=geometry.maze_map, render_mode=render_mode)
         self._init_task(geometry, success_radius, max_steps, terminate_on_success)
         EzPickle.__init__(self, maze_map, render_mode, success_radius, max_steps, terminate_on_success)
@@ -128,7 +128,7 @@ class PointMazeEnv(_MujocoMazeTask, point_maze.PointMazeEnv):
         return self._get_obs(self.point_env._get_obs()[0])
 
 
-class AntMazeEnv(_MujocoMazeTask, ant_maze_v5.AntMazeEnv):
+class AntMazeEnv(MujocoMazeTask, ant_maze_v5.AntMazeEnv):
     """The four-legged ant in a maze of cells of 4 m.
 
     Body and model are those of gymnasium-robotics' ``AntMaze-v5`` without contact forces: the observation has 27
@@ -164,8 +164,8 @@ class AntMazeEnv(_MujocoMazeTask, ant_maze_v5.AntMazeEnv):
         max_steps: int = 1000,
         terminate_on_success: bool = False,
     ) -> None:
-        geometry = _make_geometry(maze_map, _ANT_CELL_SIZE)
-        with _private_temporary_directory():
+        geometry = make_geometry(maze_map, _ANT_CELL_SIZE)
+        with private_temporary_directory():
             super().__init__(
                 maze_map=geometry.maze_map,
                 render_mode=render_mode,
@@ -184,7 +184,13 @@ class AntMazeEnv(_MujocoMazeTask, ant_maze_v5.AntMazeEnv):
         return self._get_obs(self.ant_env._get_obs())
 
 
-def _make_geometry(maze_map: MazeMap | None, cell_size: float) -> MazeGeometry:
+def make_geometry(maze_map: MazeMap | None, cell_size: float) -> MazeGeometry:
+    """Return the geometry of a maze.
+
+    :param maze_map: rows of cells; None says what is missing
+    :param cell_size: side of a cell, in metres
+    :raises ValueError: when the map is missing or unusable
+    """
     if maze_map is None:
         raise ValueError("maze_map is required, for example maze_map=[[1, 1, 1, 1], [1, 'r', 0, 1], [1, 1, 1, 1]]")
     return MazeGeometry(maze_map, cell_size)
