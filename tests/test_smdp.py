@@ -17,6 +17,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from sb3_skillgraph import GraphPolicy, OptionsEnv, SkillGraphAgent, SMDPQLearning
 from sb3_skillgraph.events import SalientEvent
 from sb3_skillgraph.options.option import Option
+from sb3_skillgraph.smdp import FlatPolicy
 
 GAMMA = 0.9
 
@@ -110,7 +111,7 @@ def test_primitive_actions(agent: SkillGraphAgent) -> None:
     start = np.array([-1.0, 1.0])
     for i, move in enumerate([(1, 0), (0, 1), (-1, 0), (0, -1), (0, 0)]):
         env.reset(options={"start": start, "goal": [1.0, -1.0]})
-        observation, _, _, _, info = env.step(env.global_action + 1 + i)
+        observation, _, _, _, info = env.step(env.first_fixed + 1 + i)
         np.testing.assert_allclose(observation["achieved_goal"] - start, 0.25 * np.array(move))
         assert (info["option"], info["tau"]) == (f"primitive {i}", 1)
     own = lifted(agent, primitives=np.array([[0.5, -0.5]]), max_options=len(agent.options) + 2)
@@ -144,7 +145,7 @@ def test_one_step_of_the_global_policy_where_actions_have_many_dimensions(agent:
 def test_the_global_option_walks_to_the_goal_or_along_a_route(agent: SkillGraphAgent) -> None:
     env = lifted(agent)
     env.reset(options={"start": [-1.0, 1.0], "goal": [-1.0, 1.0 - 0.3]})
-    _, reward, terminated, _, info = env.step(env.global_action)
+    _, reward, terminated, _, info = env.step(env.first_fixed)
     assert terminated
     assert info["option_success"]
     assert (info["tau"], reward) == (1, 1.0)
@@ -156,7 +157,7 @@ def test_the_global_option_walks_to_the_goal_or_along_a_route(agent: SkillGraphA
 
     env = lifted(agent, route=route)
     env.reset(options={"start": [-1.0, 1.0], "goal": [1.0, -1.0]})
-    observation, _, _, _, info = env.step(env.global_action)
+    observation, _, _, _, info = env.step(env.first_fixed)
     assert asked == [([-1.0, 1.0], [1.0, -1.0])]
     assert info["tau"] <= env.timeout // 2
     if info["option_success"]:
@@ -167,9 +168,9 @@ def test_what_it_refuses(agent: SkillGraphAgent) -> None:
     with pytest.raises(ValueError, match="needs a goal environment"):
         OptionsEnv(gym.make("CartPole-v1"), agent.options)
     with pytest.raises(ValueError, match=r"global_option=agent\.global_option"):
-        OptionsEnv(gym.make(TOY), [])
+        OptionsEnv(gym.make(TOY), [], primitives=np.zeros((0, 2)))
     many: list[Option] = [agent.global_option] * 11
-    with pytest.raises(ValueError, match=r"are 17 actions, but max_options is 16: give max_options=32"):
+    with pytest.raises(ValueError, match=r"11 options and 6 actions .* max_options=16: give max_options=32"):
         OptionsEnv(gym.make(TOY), many, global_option=agent.global_option, max_options=16)
 
 
@@ -221,6 +222,29 @@ def test_the_graph_remembers_failures_for_each_environment(agent: SkillGraphAgen
     fresh, kept = np.array(again).T
     assert fresh.tolist() == np.array(state).ravel().tolist()
     assert kept.tolist() != fresh.tolist()  # it got nowhere, and knows
+
+
+def test_a_flat_policy_does_one_step_at_a_time_what_the_options_environment_does(agent: SkillGraphAgent) -> None:
+    env = lifted(agent, route=agent.planner.route)
+    policy, base = GraphPolicy(agent.planner, env), gym.make(TOY, terminate_on_success=True, max_steps=200)
+    flat, rng = FlatPolicy(policy, env), np.random.default_rng(3)
+    for _ in range(5):
+        where = {name: env.get_wrapper_attr("sample_free")(rng) for name in ("start", "goal")}
+        observation, _ = env.reset(options=where)
+        n_steps, over, state = 0, False, None
+        while not over:
+            action, state = policy.predict(observation, state)
+            observation, _, terminated, truncated, info = env.step(action)
+            n_steps, over = n_steps + info["tau"], terminated or truncated
+        plain, _ = base.reset(options=where)
+        over, state = False, None
+        for _ in range(n_steps):
+            assert not over
+            action, state = flat.predict(plain, state)
+            plain, _, terminated, truncated, _ = base.step(action)
+            over = terminated or truncated
+        assert over
+        np.testing.assert_array_equal(plain["achieved_goal"], observation["achieved_goal"])
 
 
 class SmallSMDP(gym.Env):

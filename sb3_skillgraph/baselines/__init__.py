@@ -1,5 +1,7 @@
-"""What an agent has to beat."""
+"""What the agent is compared with (sections 4.1, 4.2.1, A.5)."""
 
+from sb3_skillgraph.baselines.covering_options import CoveringOptions
+from sb3_skillgraph.baselines.goal_conditioned import GoalSchedule, make_her, make_uvfa
 from sb3_skillgraph.baselines.random_walk import RandomWalk
 
-__all__ = ["RandomWalk"]
+__all__ = ["CoveringOptions", "GoalSchedule", "RandomWalk", "make_her", "make_uvfa"]

@@ -101,12 +101,27 @@ class FiedlerEmbedding:
         return th.as_tensor((points - self._center) * self._scale, dtype=th.float32)
 
 
+def learn_fiedler(store: TransitionStore, reach: int, n_pairs: int, rng: np.random.Generator) -> FiedlerEmbedding:
+    """Learn the Fiedler embedding of an agent's experience.
+
+    Pairs of states some steps apart on one trajectory, instead of neighbours, make the slowest direction stand out
+    (Wu et al. 2019: multi-step transitions).
+
+    :param store: the experience
+    :param reach: environment steps that a pair lies at most apart
+    :param n_pairs: number of pairs
+    :param rng: random generator
+    """
+    rows = rng.integers(store.oldest, store.total, n_pairs)
+    later = store.future(rows, reach, rng)
+    return FiedlerEmbedding().fit(store.column("achieved_goal", rows), store.column("next_achieved_goal", later), rng)
+
+
 class DCOSalience:
     """The two visited states that are farthest apart in the graph of the agent's transitions (section 3.2.1, *DCO*).
 
     Whenever there is new experience, a :class:`FiedlerEmbedding` is learned from scratch; where it is largest and where
-    it is smallest are proposed, one after the other. Pairs of states some steps apart on one trajectory, instead of
-    neighbours, make the slowest direction stand out (Wu et al. 2019, multi-step transitions).
+    it is smallest are proposed, one after the other.
 
     :param store: the agent's transitions
     :param visited: the agent's trajectories: events lie on visited states
@@ -126,16 +141,6 @@ class DCOSalience:
         """Propose one end of the explored space, then the other; None until there is new experience."""
         if self.store.total > self._learned_from and len(self.store) and self.visited.size:
             self._learned_from = self.store.total
-            values = self.embed(rng)(self.visited.points)
+            values = learn_fiedler(self.store, self.reach, self.n_pairs, rng)(self.visited.points)
             self._candidates = [self.visited.points[i].astype(np.float64) for i in (values.argmin(), values.argmax())]
         return self._candidates.pop() if self._candidates else None
-
-    def embed(self, rng: np.random.Generator) -> FiedlerEmbedding:
-        """Learn the embedding of the present experience.
-
-        :param rng: random generator
-        """
-        rows = rng.integers(self.store.oldest, self.store.total, self.n_pairs)
-        later = self.store.future(rows, self.reach, rng)
-        points, successors = self.store.column("achieved_goal", rows), self.store.column("next_achieved_goal", later)
-        return FiedlerEmbedding().fit(points, successors, rng)

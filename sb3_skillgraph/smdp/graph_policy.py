@@ -32,9 +32,12 @@ class GraphPolicy:
 
     :param planner: plans over the graph
     :param env: tells which option is which action
+    :raises ValueError: if the environment has no global option
     """
 
     def __init__(self, planner: GraphPlanner, env: OptionsEnv) -> None:
+        if env.global_option is None:
+            raise ValueError("Outside the graph the global option walks: OptionsEnv(..., global_option=agent.global_option).")
         self.planner = planner
         self.env = env
 
@@ -69,7 +72,7 @@ class GraphPolicy:
     def _learn_of_failure(self, last: GraphPolicyState, i: int, point: np.ndarray) -> None:
         """Note whether the option that has just ended did not get where it leads."""
         action = int(last.action[i])
-        if action >= self.env.global_action:
+        if action >= self.env.first_fixed:
             last.failures[i] += 1
         elif action >= 0:
             last.failed[i] = -1 if self.env.options[action].terminates(point) else action
@@ -80,4 +83,4 @@ class GraphPolicy:
         path = legs[last.failures[i] // PATIENCE % len(legs)].path if legs else None
         if path is not None and mask[action := self.env.index(path.vertices[0])]:
             return action
-        return self.env.global_action
+        return self.env.first_fixed  # the global option

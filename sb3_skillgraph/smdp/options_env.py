@@ -16,12 +16,12 @@ MASK = "action_mask"
 Route = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
-class _Run(NamedTuple):
+class Run(NamedTuple):
     """One action while it is being executed.
 
     :param id: the option's id, or ``primitive 0``, ...
     :param option: whose policy acts; None for a primitive action
-    :param action: the primitive action, scaled to [-1, 1]
+    :param primitive: the primitive action, scaled to [-1, 1]; None for an option
     :param aim: where the option is to go, shape ``(goal_dim,)``
     :param reached: whether it has got there, given where the agent stands
     :param timeout: environment steps it may take
@@ -29,7 +29,7 @@ class _Run(NamedTuple):
 
     id: str
     option: Option | None
-    action: np.ndarray | None
+    primitive: np.ndarray | None
     aim: np.ndarray
     reached: Callable[[np.ndarray], bool]
     timeout: int
@@ -40,9 +40,9 @@ class OptionsEnv(gym.Wrapper):
     An environment whose actions are options.
 
     Action ``i`` runs ``options[i]`` until it reaches its termination set, times out or the episode ends. The last actions
-    can always be taken: the global option, which walks to the goal, then primitive actions, which take one step. The
-    reward is the discounted sum of the rewards on the way, and ``info`` has ``tau`` (environment steps taken), ``discount``
-    (``gamma ** tau``), ``option`` (id) and ``option_success``.
+    can always be taken: the global option, if there is one, which walks to the goal, then primitive actions, which take one
+    step. The reward is the discounted sum of the rewards on the way, and ``info`` has ``tau`` (environment steps taken),
+    ``discount`` (``gamma ** tau``), ``option`` (id) and ``option_success``.
 
     Observations gain an entry ``action_mask``, which :meth:`action_masks` returns as well: an option may run if it is
     mature, stands in its (optimistic) initiation set and not yet in its termination set. Options may be appended to the
@@ -59,7 +59,7 @@ class OptionsEnv(gym.Wrapper):
     :param view: what the options' policies see; by default what the environment names in ``option_view``
     :param route: tells, given where the agent stands and its goal, where the global option is to go first; by default
         straight to the goal
-    :raises ValueError: if the environment is no goal environment, there is no global option, or not enough room
+    :raises ValueError: if the environment is no goal environment, nothing can always be done, or there is too little room
     """
 
     def __init__(
@@ -85,10 +85,11 @@ class OptionsEnv(gym.Wrapper):
         self.gamma = gamma
         self.timeout = timeout
         self.route = route
-        self.global_option = self._find_global(global_option)
+        self.global_option: Option | None = global_option or getattr(options, "global_option", None)
         self.primitives = self._find_primitives(env.action_space, primitives)
         name = env.get_wrapper_attr("option_view") if env.has_wrapper_attr("option_view") else "relative"
-        self.view = view or ScaledView(VIEWS[name], self.global_option.radius)
+        radius = 1.0 if self.global_option is None else self.global_option.radius
+        self.view = view or ScaledView(VIEWS[name], radius)
         self.max_options = max_options
         self.action_space = spaces.Discrete(max_options)
         self.observation_space = spaces.Dict({**inner.spaces, MASK: spaces.MultiBinary(max_options)})
@@ -96,36 +97,34 @@ class OptionsEnv(gym.Wrapper):
         self._last: dict[str, np.ndarray] | None = None
         self._check_room()
 
-    def _find_global(self, given: Option | None) -> Option:
-        found = given or getattr(self.options, "global_option", None)
-        if found is None:
-            raise ValueError(
-                "OptionsEnv needs a global option, lest there be places where no option can run: give "
-                "global_option=agent.global_option."
-            )
-        return found
-
     def _find_primitives(self, space: spaces.Box, given: np.ndarray | None) -> list[np.ndarray | None]:
         dim = int(np.prod(space.shape))
         if given is not None:
-            return list(np.asarray(given, dtype=np.float32).reshape(-1, dim))
-        if dim > 2:
-            return [None]  # a step of the global policy
-        axes = np.eye(dim, dtype=np.float32)
-        return [*axes, *-axes, np.zeros(dim, dtype=np.float32)]
+            primitives: list[np.ndarray | None] = list(np.asarray(given, dtype=np.float32).reshape(-1, dim))
+        elif dim <= 2:
+            axes = np.eye(dim, dtype=np.float32)
+            primitives = [*axes, *-axes, np.zeros(dim, dtype=np.float32)]
+        else:
+            primitives = [None] if self.global_option is not None else []  # one step of the global policy
+        if not primitives and self.global_option is None:
+            raise ValueError(
+                "There are neither primitive actions nor a global option, so that there could be places where nothing can "
+                "be done: give global_option=agent.global_option."
+            )
+        return primitives
 
     def _check_room(self) -> None:
-        if len(self.options) > self.global_action:
-            needed = len(self.options) + 1 + len(self.primitives)
+        if len(self.options) > self.first_fixed:
+            needed = self.max_options - self.first_fixed + len(self.options)
             raise ValueError(
-                f"{len(self.options)} options, the global option and {len(self.primitives)} primitive actions are {needed} "
-                f"actions, but max_options is {self.max_options}: give max_options={2 ** math.ceil(math.log2(needed))}."
+                f"{len(self.options)} options and {needed - len(self.options)} actions that can always be taken do not fit "
+                f"into max_options={self.max_options}: give max_options={2 ** math.ceil(math.log2(needed))}."
             )
 
     @property
-    def global_action(self) -> int:
-        """Index of the global option; primitive actions follow."""
-        return self.max_options - len(self.primitives) - 1
+    def first_fixed(self) -> int:
+        """The first of the actions that can always be taken: the global option if there is one, then primitives."""
+        return self.max_options - len(self.primitives) - (self.global_option is not None)
 
     def index(self, option: str) -> int:
         """Return an option's action.
@@ -158,15 +157,23 @@ class OptionsEnv(gym.Wrapper):
         """
         if self._last is None:
             raise ValueError("Call reset before action_masks: which options can start depends on where the agent stands.")
-        self._check_room()
-        point = np.asarray(self._last["achieved_goal"])
-        mask = np.zeros(self.max_options, dtype=bool)
-        mask[: len(self.options)] = [self._can_run(option, point) for option in self.options]
-        mask[self.global_action :] = True
-        return mask
+        return self.masks_at(self._last)
 
-    def _can_run(self, option: Option, point: np.ndarray) -> bool:
-        return option.mature and bool(option.initiation.optimistic(point[None])[0]) and not option.terminates(point)
+    def masks_at(self, observation: dict[str, np.ndarray]) -> np.ndarray:
+        """Tell which actions can be taken.
+
+        :param observation: of the wrapped environment
+        :return: bool array of shape ``(max_options,)``, never all False
+        """
+        self._check_room()
+        point = np.asarray(observation["achieved_goal"])
+        mask = np.zeros(self.max_options, dtype=bool)
+        mask[: len(self.options)] = [
+            option.mature and bool(option.initiation.optimistic(point[None])[0]) and not option.terminates(point)
+            for option in self.options
+        ]
+        mask[self.first_fixed :] = True
+        return mask
 
     def step(self, action: int | np.ndarray) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
         """Run an option.
@@ -175,10 +182,13 @@ class OptionsEnv(gym.Wrapper):
         :return: observation, discounted sum of rewards, terminated, truncated, info
         :raises ValueError: if the action is masked
         """
-        run = self._begin(int(action))
+        if not self.action_masks()[int(action)]:
+            raise ValueError(f"Action {action} cannot be taken here: see action_masks().")
+        assert self._last is not None
+        run = self.begin(self._last, int(action))
         total, discount, tau = 0.0, 1.0, 0
         while True:
-            observation, reward, terminated, truncated, info = self.env.step(self._act(run))
+            observation, reward, terminated, truncated, info = self.env.step(self.act(run, self._last))
             self._last = observation
             total += discount * float(reward)
             discount *= self.gamma
@@ -189,38 +199,52 @@ class OptionsEnv(gym.Wrapper):
         info = {**info, "tau": tau, "discount": discount, "option": run.id, "option_success": what == Fate.SUCCEEDED}
         return self._see(observation), total, terminated, truncated, info
 
-    def _begin(self, action: int) -> _Run:
-        if not self.action_masks()[action]:
-            raise ValueError(f"Action {action} cannot be taken here: see action_masks().")
-        assert self._last is not None
-        point, goal = np.asarray(self._last["achieved_goal"]), np.asarray(self._last["desired_goal"])
-        if action < self.global_action:
+    def begin(self, observation: dict[str, np.ndarray], action: int) -> Run:
+        """Begin to execute an action.
+
+        :param observation: of the wrapped environment
+        :param action: its index
+        """
+        point, goal = np.asarray(observation["achieved_goal"]), np.asarray(observation["desired_goal"])
+        if action < self.first_fixed:
             option = self.options[action]
-            return _Run(option.id, option, None, option.subgoal, option.terminates, self.timeout)
-        if action > self.global_action:
-            index = action - self.global_action - 1
+            return Run(option.id, option, None, option.subgoal, option.terminates, self.timeout)
+        index = action - self.max_options + len(self.primitives)
+        if index >= 0:
             primitive = self.primitives[index]
             acts = self.global_option if primitive is None else None
-            return _Run(f"primitive {index}", acts, primitive, goal, lambda point: True, 1)
+            return Run(f"primitive {index}", acts, primitive, goal, lambda point: True, 1)
+        assert self.global_option is not None
         aim, radius = goal, self.global_option.radius
         if self.route is not None:
             aim = self.route(point, goal)
             radius = radius if aim is goal else 0.5 * radius
-        reached = lambda point: math.dist(point, aim) <= radius  # noqa: E731
-        return _Run(self.global_option.id, self.global_option, None, aim, reached, self.timeout // 2)
+        return Run(
+            self.global_option.id,
+            self.global_option,
+            None,
+            aim,
+            lambda point: math.dist(point, aim) <= radius,
+            self.timeout // 2,
+        )
 
-    def _act(self, run: _Run) -> np.ndarray:
-        assert self._last is not None
-        scaled = run.action
+    def act(self, run: Run, observation: dict[str, np.ndarray]) -> np.ndarray:
+        """Return what a running option does.
+
+        :param run: what :meth:`begin` returned
+        :param observation: of the wrapped environment
+        :return: an action in the wrapped environment's own bounds
+        """
+        scaled = run.primitive
         if run.option is not None:
-            observation, point = (
-                np.asarray(self._last[key], dtype=np.float32).reshape(1, -1) for key in ("observation", "achieved_goal")
+            seen, point = (
+                np.asarray(observation[key], dtype=np.float32).reshape(1, -1) for key in ("observation", "achieved_goal")
             )
-            scaled = run.option.actor.act(self.view(observation, point, run.aim[None].astype(np.float32)))[0]
+            scaled = run.option.actor.act(self.view(seen, point, run.aim[None].astype(np.float32)))[0]
         assert scaled is not None
         low, high = self._inner_space.low, self._inner_space.high
         return (low + 0.5 * (scaled.reshape(low.shape) + 1.0) * (high - low)).astype(self._inner_space.dtype)
 
     def _see(self, observation: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         self._last = observation
-        return {**observation, MASK: self.action_masks().astype(np.int8)}
+        return {**observation, MASK: self.masks_at(observation).astype(np.int8)}

@@ -1,0 +1,309 @@
+"""Deep covering options: skills to the ends of the explored space, composed by SMDP Q-learning (sections 2.3, 4, A.5)."""
+
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.type_aliases import ReplayBufferSamples
+
+from sb3_skillgraph.baselines.goal_conditioned import GoalSchedule
+from sb3_skillgraph.goal_env import GoalSpec
+from sb3_skillgraph.options.factory import OptionFactory
+from sb3_skillgraph.options.initiation import InitiationSet
+from sb3_skillgraph.options.learner import OptionDDPG
+from sb3_skillgraph.options.option import Option
+from sb3_skillgraph.options.views import VIEWS, ScaledView
+from sb3_skillgraph.replay import OptionReplay, TransitionStore
+from sb3_skillgraph.salience.dco import FiedlerEmbedding, learn_fiedler
+from sb3_skillgraph.smdp import FlatPolicy, OptionsEnv, SMDPQLearning
+
+TERMINATION_SHARE = 0.05  # of the states seen, those with the lowest values are where an option ends
+REACH = 60  # steps that the pairs lie at most apart that an embedding is learned from
+
+
+class LowEnd:
+    """The states where an embedding is lower than a threshold: where a covering option ends (Jinnai et al. 2020).
+
+    :param embedding: the approximate Fiedler vector
+    :param sign: -1 for the other end
+    :param points: states seen, shape ``(n, goal_dim)``
+    """
+
+    def __init__(self, embedding: FiedlerEmbedding, sign: float, points: np.ndarray) -> None:
+        self.embedding = embedding
+        self.sign = sign
+        values = self.values(points)
+        self.threshold = float(np.quantile(values, TERMINATION_SHARE))
+        self.center = points[int(values.argmin())].astype(np.float64)
+
+    def values(self, points: np.ndarray) -> np.ndarray:
+        """Return the embedding, lowest at the end the option leads to.
+
+        :param points: shape ``(n, goal_dim)``
+        :return: shape ``(n,)``
+        """
+        return self.sign * self.embedding(points)
+
+    def contains(self, points: np.ndarray) -> np.ndarray:
+        """Tell which points lie in the set.
+
+        :param points: shape ``(n, goal_dim)``
+        :return: bool array of shape ``(n,)``
+        """
+        return self.values(points) <= self.threshold
+
+    def holds(self, point: np.ndarray) -> bool:
+        """Tell whether a point, shape ``(goal_dim,)``, lies in the set."""
+        return bool(self.contains(np.asarray(point)[None])[0])
+
+
+class Everywhere(InitiationSet):
+    """Covering options can start anywhere but where they end."""
+
+    def optimistic(self, points: np.ndarray) -> np.ndarray:
+        """:param points: shape ``(n, goal_dim)``"""
+        return np.ones(len(points), dtype=bool)
+
+
+class CoveringReplay(OptionReplay):
+    """All experience, paid for going down the embedding."""
+
+    end: LowEnd
+    scale: float
+
+    def sample(self, batch_size: int, env: Any = None) -> ReplayBufferSamples:
+        """Draw relabelled transitions.
+
+        :param batch_size: number of transitions
+        :param env: not used
+        :return: tensors of shape ``(batch_size, ...)``
+        """
+        rows = self.rng.integers(self.store.oldest, self.store.total, batch_size)
+        data = self.store.read(rows)
+        here, there = data["achieved_goal"], data["next_achieved_goal"]
+        goal = np.tile(self.end.center.astype(np.float32), (batch_size, 1))
+        before, after = self.end.values(here), self.end.values(there)
+        done = (after <= self.end.threshold) | self.store.terminated(rows)
+        return ReplayBufferSamples(
+            observations=self._tensor(self.view(data["observation"], here, goal)),
+            actions=self._tensor(data["action"]),
+            next_observations=self._tensor(self.view(data["next_observation"], there, goal)),
+            dones=self._tensor(done.astype(np.float32)[:, None]),
+            rewards=self._tensor(((before - after) / self.scale).astype(np.float32)[:, None]),
+        )
+
+
+class CoveringOptions:
+    """
+    The paper's hierarchical baseline: a fixed number of covering options and primitive actions, chosen among by SMDP
+    Q-learning for a goal that is given (section 4, A.5).
+
+    Every 30 episodes (more often if there are fewer) an embedding of all experience is learned, and an option to one of
+    its two ends, in turns, by DDPG on all experience; from then on it is among the actions of Q-learning.
+
+    :param env: a goal environment whose episodes end, and are paid, at the goal
+    :param n_options: number of options; the paper tries 3, 4, 5 and 10
+    :param option_freq: episodes between options
+    :param goal_freq: episodes per goal
+    :param option_updates: gradient steps when an option is made; later one every ``train_freq`` steps for one of them
+    :param train_freq: environment steps per gradient step
+    :param batch_size: transitions in a minibatch
+    :param gamma: discount factor per environment step
+    :param exploration_noise: standard deviation of the noise on options' scaled actions while learning
+    :param seed: of everything random
+    """
+
+    def __init__(
+        self,
+        env: gym.Env,
+        *,
+        n_options: int = 5,
+        option_freq: int = 30,
+        goal_freq: int = 30,
+        option_updates: int = 5_000,
+        train_freq: int = 2,
+        batch_size: int = 128,
+        gamma: float = 0.99,
+        exploration_noise: float = 0.1,
+        seed: int = 0,
+    ) -> None:
+        assert isinstance(env.action_space, spaces.Box)
+        self.n_options = n_options
+        self.option_freq = option_freq
+        self.option_updates = option_updates
+        self.train_freq = train_freq
+        self.batch_size = batch_size
+        self.exploration_noise = exploration_noise
+        self.rng = np.random.default_rng(seed)
+        self.num_timesteps = 0
+        self.options: list[Option] = []
+        spec = GoalSpec.of(env.observation_space, env.action_space)
+        self.store = TransitionStore(1_000_000, spec.observation_dim, spec.goal_dim, spec.action_dim)
+        radius = float(env.get_wrapper_attr("success_radius"))
+        view = ScaledView(VIEWS[env.get_wrapper_attr("option_view")], radius)
+        kwargs = dict(
+            gamma=gamma,
+            actor_learning_rate=1e-3,
+            critic_learning_rate=1e-3,
+            saturation_penalty=1e-4,
+            policy_kwargs={"net_arch": [128, 128]},
+        )
+        self._factory = OptionFactory(
+            OptionDDPG, kwargs, self.store, view, env.action_space, radius, radius, self.rng, {}, th.device("cpu")
+        )
+        self.env = OptionsEnv(
+            _Recorder(GoalSchedule(env, goal_freq), self), self.options, max_options=n_options + 8, gamma=gamma, view=view
+        )
+        self.model = _QLearning(
+            "MultiInputPolicy",
+            Monitor(self.env),
+            learning_rate=1e-3,
+            learning_starts=100,
+            batch_size=64,
+            gamma=gamma,
+            train_freq=1,
+            target_update_interval=500,
+            exploration_fraction=0.5,
+            exploration_final_eps=0.1,
+            policy_kwargs={"net_arch": [128, 128]},
+            seed=seed,
+        )
+        self.model.budget = _Budget(self)
+        self._policy = FlatPolicy(self.model, self.env)
+        self._next_option = option_freq
+        self._n_episodes = 0
+        self._on_step: Callable[[int], None] | None = None
+
+    def learn(self, total_timesteps: int, on_step: Callable[[int], None] | None = None) -> "CoveringOptions":
+        """Learn.
+
+        :param total_timesteps: environment steps, not decisions
+        :param on_step: called after every environment step with their number
+        :return: itself
+        """
+        self._on_step = on_step
+        episodes = total_timesteps // int(self.env.get_wrapper_attr("max_steps"))
+        self._next_option = self.option_freq = max(1, min(self.option_freq, episodes // (self.n_options + 1)))
+        self.model.budget.start, self.model.budget.total = self.num_timesteps, total_timesteps
+        self.model.learn(total_timesteps, callback=self.model.budget, log_interval=1_000_000)
+        return self
+
+    def predict(
+        self,
+        observation: dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
+        """
+        Act towards the observation's goal.
+
+        :param observation: one observation
+        :param state: what the last call returned
+        :param episode_start: where an episode begins, and the state is forgotten
+        :param deterministic: whether Q-learning chooses greedily
+        :return: the action, and the state
+        """
+        return self._policy.predict(observation, state, episode_start, deterministic)
+
+    def after_step(self, transition: dict[str, np.ndarray], terminated: bool, done: bool) -> None:
+        """Learn from one environment step.
+
+        :param transition: columns of the store, each of shape ``(1, dim)``
+        :param terminated: whether the environment ended for good
+        :param done: whether the episode ended
+        """
+        self.store.add(**transition, terminated=np.array([terminated]), done=np.array([done]))
+        self.num_timesteps += 1
+        if self.options and self.num_timesteps % self.train_freq == 0:
+            turn = self.num_timesteps // self.train_freq % len(self.options)
+            self.options[turn].learner.train(1, self.batch_size)
+        self._n_episodes += done
+        if done and self._n_episodes >= self._next_option and len(self.options) < self.n_options:
+            self._next_option = self._n_episodes + self.option_freq
+            self.options.append(self._make_option())
+        if self._on_step is not None:
+            self._on_step(self.num_timesteps)
+
+    def _make_option(self) -> Option:
+        embedding = learn_fiedler(self.store, REACH, 20_000, self.rng)
+        rows = self.rng.integers(self.store.oldest, self.store.total, 20_000)
+        end = LowEnd(embedding, 1.0 if len(self.options) % 2 == 0 else -1.0, self.store.column("achieved_goal", rows))
+        option = self._factory.make(f"c{len(self.options)}", "low end", end)
+        replay = option.replay
+        option.learner.replay_buffer = covering = CoveringReplay(
+            self.store, replay.view, replay.rule, self._factory.observation_space, self._factory.action_space, self.rng
+        )
+        steps = end.values(self.store.column("next_achieved_goal", rows)) - end.values(
+            self.store.column("achieved_goal", rows)
+        )
+        covering.end, covering.scale = end, float(np.quantile(np.abs(steps), 0.95)) or 1.0
+        option.initiation = Everywhere(option.radius)
+        option.mature = True
+        for _ in range(self.option_updates):
+            option.learner.train(1, self.batch_size)
+        return option
+
+
+class _Recorder(gym.Wrapper):
+    """Adds noise to what options do, and shows every step to the learner."""
+
+    def __init__(self, env: gym.Env, learner: CoveringOptions) -> None:
+        super().__init__(env)
+        self.learner = learner
+        self._last: dict[str, np.ndarray] = {}
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        self._last, info = self.env.reset(seed=seed, options=options)
+        return self._last, info
+
+    def step(self, action: np.ndarray) -> Any:
+        space = self.env.action_space
+        assert isinstance(space, spaces.Box)
+        half = 0.5 * (space.high - space.low)
+        action = action + self.learner.rng.normal(0.0, self.learner.exploration_noise, action.shape) * half
+        action = np.clip(action, space.low, space.high).astype(space.dtype)
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        transition = {
+            "observation": self._last["observation"],
+            "achieved_goal": self._last["achieved_goal"],
+            "next_observation": observation["observation"],
+            "next_achieved_goal": observation["achieved_goal"],
+            "action": (action - space.low) / half - 1.0,
+            "goal": self._last["desired_goal"],
+        }
+        columns = {name: np.asarray(value).reshape(1, -1) for name, value in transition.items()}
+        self._last = observation
+        self.learner.after_step(columns, terminated, terminated or truncated)
+        return observation, reward, terminated, truncated, info
+
+
+class _Budget(BaseCallback):
+    """Counts environment steps where SB3 counts decisions, and ends learning after so many."""
+
+    start, total = 0, 1
+
+    def __init__(self, learner: CoveringOptions) -> None:
+        super().__init__()
+        self.learner = learner
+
+    @property
+    def share_left(self) -> float:
+        return max(0.0, 1.0 - (self.learner.num_timesteps - self.start) / self.total)
+
+    def _on_step(self) -> bool:
+        return self.share_left > 0.0
+
+
+class _QLearning(SMDPQLearning):
+    """Explores less the fewer environment steps are left."""
+
+    budget: _Budget
+
+    def _update_current_progress_remaining(self, num_timesteps: int, total_timesteps: int) -> None:
+        self._current_progress_remaining = self.budget.share_left

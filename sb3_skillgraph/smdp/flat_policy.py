@@ -1,0 +1,76 @@
+"""A policy over options, one environment step at a time."""
+
+from typing import Any, Protocol
+
+import numpy as np
+
+from sb3_skillgraph.options.execution import Fate, fate
+from sb3_skillgraph.smdp.options_env import MASK, OptionsEnv, Run
+
+
+class HighLevel(Protocol):
+    """What chooses options: SB3's ``predict`` on the observations of an :class:`~sb3_skillgraph.OptionsEnv`."""
+
+    def predict(
+        self,
+        observation: dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """Choose an option.
+
+        :param observation: one observation
+        :param state: what the last call returned
+        :param episode_start: where an episode begins, and the state is forgotten
+        :param deterministic: whether to choose the best
+        :return: the action, and the state
+        """
+
+
+class FlatPolicy:
+    """
+    Acts in the wrapped environment of an :class:`~sb3_skillgraph.OptionsEnv` as its high level would have it.
+
+    :param high_level: chooses options
+    :param env: knows how options run; nothing happens in it
+    """
+
+    def __init__(self, high_level: HighLevel, env: OptionsEnv) -> None:
+        self.high_level = high_level
+        self.env = env
+
+    def predict(
+        self,
+        observation: dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
+        """
+        Act, and choose an option where the last one has ended.
+
+        :param observation: one observation of the wrapped environment
+        :param state: what the last call returned: the running option, its steps, and the high level's own state
+        :param episode_start: where an episode begins, and the state is forgotten; shape ``(1,)``
+        :param deterministic: passed to the high level
+        :return: the action, and the state
+        """
+        run: Run | None = None
+        steps, memory = 0, None
+        if state is not None and not (episode_start is not None and np.any(episode_start)):
+            run, steps, memory = state[0].item(), int(state[1][0]), state[2].item()
+        if run is not None and fate(run.reached(np.asarray(observation["achieved_goal"])), steps, run.timeout) != Fate.RUNNING:
+            run, steps = None, 0
+        if run is None:
+            seen = {**observation, MASK: self.env.masks_at(observation).astype(np.int8)}
+            action, memory = self.high_level.predict(seen, memory, None, deterministic)
+            run = self.env.begin(observation, int(action))
+        return self.env.act(run, observation), (boxed(run), np.array([steps + 1]), boxed(memory))
+
+
+def boxed(item: Any) -> np.ndarray:
+    """Put anything into an array of shape (1,): SB3's states are tuples of arrays."""
+    box = np.empty(1, dtype=object)
+    box[0] = item
+    return box
