@@ -40,7 +40,7 @@ FLOORS: dict[str, float] = {
     "callbacks": 6,
     "baselines": 6,
     "plotting": 7,
-    "hyperparams": 8,
+    "hyperparams": 7.5,
     "experiments": 8,
     "cli": 9,
     "__main__": 10,

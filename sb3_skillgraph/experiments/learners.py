@@ -1,0 +1,174 @@
+"""The methods that are compared, each behind the same few calls."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+from gymnasium import spaces
+from stable_baselines3.common.callbacks import BaseCallback
+
+from sb3_skillgraph.agent import SkillGraphAgent
+from sb3_skillgraph.baselines import CoveringOptions, RandomWalk, make_her, make_uvfa
+from sb3_skillgraph.evaluation import Predictor
+from sb3_skillgraph.hyperparams import check_hyperparams, load_hyperparams
+
+Check = Callable[[int], None]
+
+
+class Learner(ABC):
+    """A method at work on one environment.
+
+    :param env_id: id of the environment
+    :param env_kwargs: its keyword arguments
+    :param seed: of everything random
+    :param arguments: of the method
+    """
+
+    #: Whether it can go on from a checkpoint as if nothing had happened; others begin anew.
+    resumable = False
+    policy: Predictor
+
+    @abstractmethod
+    def __init__(self, env_id: str, env_kwargs: dict[str, Any], seed: int, arguments: dict[str, Any]) -> None: ...
+
+    @abstractmethod
+    def learn(self, begin: int, end: int, every: int, check: Check) -> None:
+        """Learn, and stop for a check every so often and at the end.
+
+        :param begin: steps done already
+        :param end: steps in all
+        :param every: steps between checks
+        :param check: called with the number of steps
+        """
+
+    def save(self, folder: Path) -> None:  # noqa: B027 - only resumable learners have something to save
+        """Take a checkpoint.
+
+        :param folder: an empty folder
+        """
+
+    def load(self, folder: Path) -> None:  # noqa: B027
+        """Go on from a checkpoint.
+
+        :param folder: what :meth:`save` has filled
+        """
+
+    def summary(self) -> dict[str, float]:
+        """Return what else is worth a column."""
+        return {}
+
+
+class SkillGraphLearner(Learner):
+    """Deep Skill Graphs; episodes do not end at goals, and there is no reward."""
+
+    resumable = True
+
+    def __init__(self, env_id: str, env_kwargs: dict[str, Any], seed: int, arguments: dict[str, Any]) -> None:
+        recommended = {**load_hyperparams(env_id), **check_hyperparams(arguments, "arguments")}
+        del recommended["n_timesteps"]
+        self.env = gym.make(env_id, **env_kwargs)
+        self.policy: SkillGraphAgent = SkillGraphAgent(env=self.env, seed=seed, **recommended)
+
+    def learn(self, begin: int, end: int, every: int, check: Check) -> None:
+        """Learn from check to check: between two calls of ``learn`` an agent can be saved exactly."""
+        for target in [*range(begin + every - begin % every, end, every), end]:
+            self.policy.learn(target - begin, log_interval=None, reset_num_timesteps=False)
+            begin = target
+            check(target)
+
+    def save(self, folder: Path) -> None:
+        """Save the agent and its experience."""
+        self.policy.save(folder / "agent.zip")
+        self.policy.save_replay_buffer(folder / "experience")
+
+    def load(self, folder: Path) -> None:
+        """Load both."""
+        self.policy = SkillGraphAgent.load(folder / "agent.zip", env=self.env)
+        self.policy.load_replay_buffer(folder / "experience")
+
+    def summary(self) -> dict[str, float]:
+        """Describe the graph."""
+        return {f"skillgraph/{name}": value for name, value in self.policy.graph_summary().items()}
+
+
+class _Checks(BaseCallback):
+    def __init__(self, every: int, end: int, check: Check) -> None:
+        super().__init__()
+        self.every = every
+        self.end = end
+        self.check = check
+
+    def _on_step(self) -> bool:
+        if self.num_timesteps % self.every == 0 and self.num_timesteps < self.end:
+            self.check(self.num_timesteps)
+        return True
+
+
+class GoalConditionedLearner(Learner):
+    """SB3's DDPG that is told the goal, with hindsight or without."""
+
+    make: Callable[..., Any]
+
+    def __init__(self, env_id: str, env_kwargs: dict[str, Any], seed: int, arguments: dict[str, Any]) -> None:
+        env = gym.make(env_id, **{"terminate_on_success": True, **env_kwargs})
+        self.policy = type(self).make(env, seed=seed, **arguments)
+
+    def learn(self, begin: int, end: int, every: int, check: Check) -> None:
+        """Learn in one go."""
+        self.policy.learn(end, callback=_Checks(every, end, check), log_interval=1_000_000)  # type: ignore[attr-defined]
+        check(end)
+
+
+class UVFALearner(GoalConditionedLearner):
+    """A new goal every 30 episodes."""
+
+    make = staticmethod(make_uvfa)
+
+
+class HERLearner(GoalConditionedLearner):
+    """A new goal every episode, and in hindsight."""
+
+    make = staticmethod(make_her)
+
+
+class CoveringOptionsLearner(Learner):
+    """Deep covering options under SMDP Q-learning."""
+
+    def __init__(self, env_id: str, env_kwargs: dict[str, Any], seed: int, arguments: dict[str, Any]) -> None:
+        env = gym.make(env_id, **{"terminate_on_success": True, **env_kwargs})
+        self.policy: CoveringOptions = CoveringOptions(env, seed=seed, **arguments)
+
+    def learn(self, begin: int, end: int, every: int, check: Check) -> None:
+        """Learn in one go."""
+
+        def on_step(n_steps: int) -> None:
+            if n_steps % every == 0 and n_steps < end:
+                check(n_steps)
+
+        self.policy.learn(end, on_step)
+        check(end)
+
+
+class RandomWalkLearner(Learner):
+    """Learns nothing; the least to beat."""
+
+    def __init__(self, env_id: str, env_kwargs: dict[str, Any], seed: int, arguments: dict[str, Any]) -> None:
+        env = gym.make(env_id, **env_kwargs)
+        assert isinstance(env.action_space, spaces.Box)
+        self.policy = RandomWalk(env.action_space, seed, **arguments)
+        env.close()
+
+    def learn(self, begin: int, end: int, every: int, check: Check) -> None:
+        """Only be tested."""
+        check(end)
+
+
+ALGORITHMS: dict[str, type[Learner]] = {
+    "skill_graph": SkillGraphLearner,
+    "uvfa": UVFALearner,
+    "her": HERLearner,
+    "covering_options": CoveringOptionsLearner,
+    "random_walk": RandomWalkLearner,
+}

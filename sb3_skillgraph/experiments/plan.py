@@ -1,0 +1,122 @@
+"""What is to be run: a YAML of methods, environments and seeds."""
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from sb3_skillgraph.experiments.learners import ALGORITHMS
+from sb3_skillgraph.hyperparams import check_hyperparams, did_you_mean
+
+_TOP = {"methods": dict, "environments": dict, "seeds": list, "check_every": int, "pairs": int, "final_pairs": int}
+_METHOD = {"algorithm": str, "arguments": dict}
+_ENVIRONMENT = {"id": str, "kwargs": dict, "steps": int, "seeds": list, "methods": list}
+
+
+@dataclass(frozen=True)
+class RunSpec:
+    """One run.
+
+    :param method: its name in the plan
+    :param environment: its name in the plan
+    :param seed: of everything random; pairs are drawn with ``seed + 1000``
+    :param algorithm: ``skill_graph``, ``uvfa``, ``her``, ``covering_options`` or ``random_walk``
+    :param env_id: id of a ``SkillGraph/*`` environment
+    :param steps: environment steps
+    :param check_every: steps between tests, after each of which a checkpoint is taken
+    :param pairs: pairs of start and goal in these tests
+    :param final_pairs: pairs in the last one
+    :param arguments: of the algorithm
+    :param env_kwargs: of the environment
+    """
+
+    method: str
+    environment: str
+    seed: int
+    algorithm: str
+    env_id: str
+    steps: int
+    check_every: int = 10_000
+    pairs: int = 20
+    final_pairs: int = 100
+    arguments: dict[str, Any] = field(default_factory=dict)
+    env_kwargs: dict[str, Any] = field(default_factory=dict)
+
+    def folder(self, out: Path) -> Path:
+        """Return where the run lies in the folder of all runs."""
+        return out / self.environment / self.method / f"seed{self.seed}"
+
+    def as_plain(self) -> dict[str, Any]:
+        """Return it as plain data."""
+        return asdict(self)
+
+
+def load_plan(path: Path) -> list[RunSpec]:
+    """Read a plan.
+
+    :param path: YAML file: ``methods`` (name -> ``algorithm``, ``arguments``), ``environments`` (name -> ``id``,
+        ``kwargs``, ``steps``, and ``seeds`` or ``methods`` where not all are wanted), ``seeds``, ``check_every``,
+        ``pairs``, ``final_pairs``
+    :return: one spec for each run, seed by seed, so that the first results compare all methods
+    :raises ValueError: if the file says anything else, or too little
+    """
+    try:
+        document = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except yaml.YAMLError as error:
+        raise ValueError(f"{path} is no valid YAML: {' '.join(str(error).split())}") from error
+    top = _checked(document, _TOP, str(path), required=("methods", "environments", "seeds"))
+    methods = {
+        str(name): _checked(value, _METHOD, f"{path}, method {name!r}", required=("algorithm",))
+        for name, value in top["methods"].items()
+    }
+    for name, method in methods.items():
+        if method["algorithm"] not in ALGORITHMS:
+            hint = did_you_mean(method["algorithm"], ALGORITHMS)
+            raise ValueError(f"{path}, method {name!r}: unknown algorithm {method['algorithm']!r}{hint}.")
+        if method["algorithm"] == "skill_graph":
+            check_hyperparams(method.get("arguments", {}), f"{path}, method {name!r}")
+    environments = {
+        str(name): _checked(value, _ENVIRONMENT, f"{path}, environment {name!r}", required=("id", "steps"))
+        for name, value in top["environments"].items()
+    }
+    common = {name: top[name] for name in ("check_every", "pairs", "final_pairs") if name in top}
+    specs = []
+    for label, env in environments.items():
+        unknown = [name for name in env.get("methods", ()) if name not in methods]
+        if unknown:
+            raise ValueError(
+                f"{path}, environment {label!r}: unknown method {unknown[0]!r}{did_you_mean(unknown[0], methods)}."
+            )
+        specs += [
+            RunSpec(
+                name,
+                label,
+                int(seed),
+                methods[name]["algorithm"],
+                env["id"],
+                env["steps"],
+                arguments=methods[name].get("arguments", {}),
+                env_kwargs=env.get("kwargs", {}),
+                **common,
+            )
+            for seed in env.get("seeds", top["seeds"])
+            for name in env.get("methods", methods)
+        ]
+    return specs
+
+
+def _checked(value: Any, keys: Mapping[str, type], where: str, required: tuple[str, ...]) -> dict[str, Any]:
+    if not isinstance(value, dict):
+        raise ValueError(f"{where}: a mapping is wanted, not {value!r}.")
+    for name, item in value.items():
+        if name not in keys:
+            raise ValueError(f"{where}: unknown entry {name!r}{did_you_mean(str(name), keys)}.")
+        if not isinstance(item, keys[name]) or (isinstance(item, int) and item < 1):
+            kind = {dict: "a mapping", list: "a list", int: "a positive number", str: "a name"}[keys[name]]
+            raise ValueError(f"{where}: {name} must be {kind}, not {item!r}.")
+    missing = [name for name in required if not value.get(name)]
+    if missing:
+        raise ValueError(f"{where}: {missing[0]} is missing.")
+    return value

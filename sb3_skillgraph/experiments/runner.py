@@ -1,0 +1,244 @@
+"""Doing runs: what is done is skipped, what was killed is resumed, and no run is done twice at a time."""
+
+import csv
+import io
+import json
+import os
+import shutil
+import time
+import traceback
+from collections.abc import Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import torch as th
+from filelock import FileLock, Timeout
+from joblib import Parallel, delayed, parallel_config
+
+from sb3_skillgraph.evaluation import PairsResult, evaluate_pairs
+from sb3_skillgraph.experiments.learners import ALGORITHMS, Learner
+from sb3_skillgraph.experiments.plan import RunSpec
+
+CONFIG, PROGRESS, DONE, ERROR, LOCK = "config.json", "progress.csv", "done.json", "error.txt", "lock"
+STEPS, SECONDS = "time/total_timesteps", "time/seconds"
+Outcome = Literal["done", "skipped", "elsewhere", "failed"]
+_VERSIONS_OF = ("sb3_skillgraph", "stable_baselines3", "torch", "gymnasium", "gymnasium_robotics", "mujoco", "numpy")
+
+
+class RunStatus(NamedTuple):
+    """How a run stands.
+
+    :param spec: the run
+    :param state: ``done``, ``running``, ``failed``, ``stopped`` (to be resumed) or ``waiting``
+    :param steps: environment steps whose results are on disk
+    :param seconds_left: estimate; None before the first check
+    :param success_rate: last measured; None before the first check
+    """
+
+    spec: RunSpec
+    state: Literal["done", "running", "failed", "stopped", "waiting"]
+    steps: int
+    seconds_left: float | None
+    success_rate: float | None
+
+
+def compare(specs: Sequence[RunSpec], out: Path, n_jobs: int = 1, backend: str = "loky") -> list[Outcome]:
+    """Do runs.
+
+    :param specs: the runs
+    :param out: folder for all of them; other workers may be at work in it
+    :param n_jobs: runs at a time
+    :param backend: joblib's: ``loky``, ``ray`` or ``dask``, which bring their own clusters
+    :return: what became of each
+    :raises ValueError: if the backend is not installed
+    """
+    if backend == "ray":
+        _register_ray()
+    with parallel_config(backend=backend, n_jobs=n_jobs):
+        return list(Parallel()(delayed(run)(spec, out) for spec in specs))
+
+
+def _register_ray() -> None:
+    try:
+        from ray.util.joblib import register_ray  # type: ignore[import-not-found, unused-ignore]
+    except ImportError as error:
+        raise ValueError("The backend ray needs Ray: pip install ray.") from error
+    register_ray()
+
+
+def run(spec: RunSpec, out: Path) -> Outcome:
+    """Do one run, from its last checkpoint if there is one; an error is written into its folder.
+
+    :param spec: the run
+    :param out: folder for all runs
+    """
+    th.set_num_threads(1)
+    folder = spec.folder(out)
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        # The lock falls with the process that holds it, however that ends.
+        with FileLock(folder / LOCK, timeout=0):
+            if (folder / DONE).exists():
+                return "skipped"
+            try:
+                _Run(spec, folder).do()
+            except Exception:
+                write_atomically(folder / ERROR, traceback.format_exc())
+                return "failed"
+            return "done"
+    except Timeout:
+        return "elsewhere"
+
+
+class _Run:
+    def __init__(self, spec: RunSpec, folder: Path) -> None:
+        self.spec = spec
+        self.folder = folder
+        self.result: PairsResult | None = None
+        self.rows: list[dict[str, Any]] = []
+        self.seconds = 0.0
+        self._clock = 0.0
+
+    def do(self) -> None:
+        spec, folder = self.spec, self.folder
+        self._check_config()
+        (folder / ERROR).unlink(missing_ok=True)
+        self.learner = ALGORITHMS[spec.algorithm](spec.env_id, spec.env_kwargs, spec.seed, spec.arguments)
+        begin = self._resume(self.learner)
+        self._clock = time.perf_counter()
+        if begin < spec.steps:
+            self.learner.learn(begin, spec.steps, spec.check_every, self._check)
+        result = self.result or self._test(spec.steps)
+        document = {
+            "success_rate": result.success_rate,
+            "interval": result.interval,
+            "seconds": round(self.seconds, 1),
+            "pairs": [
+                {"path_length": round(p.path_length, 3), "success": bool(p.success), "steps": p.steps} for p in result.pairs
+            ],
+            **self.learner.summary(),
+        }
+        write_atomically(folder / DONE, json.dumps(document, indent=1) + "\n")
+
+    def _check_config(self) -> None:
+        versions = {name: version(name) for name in _VERSIONS_OF}
+        path, config = self.folder / CONFIG, json.loads(json.dumps(self.spec.as_plain()))
+        if path.exists():
+            before = {name: value for name, value in json.loads(path.read_text()).items() if name != "versions"}
+            if before != config:
+                raise ValueError(f"{self.folder} holds a run with another configuration: remove it, or choose another folder.")
+        else:
+            write_atomically(path, json.dumps({**config, "versions": versions}, indent=1) + "\n")
+
+    def _resume(self, learner: Learner) -> int:
+        """Load the newest checkpoint and drop what was written after it; return the steps done."""
+        saved = checkpoints(self.folder)
+        steps = max(saved, default=0) if learner.resumable else 0
+        if steps:
+            learner.load(saved[steps])
+        self.rows = [row for row in read_progress(self.folder) if int(row[STEPS]) <= steps]
+        self.seconds = float(self.rows[-1][SECONDS]) if self.rows else 0.0
+        return steps
+
+    def _check(self, n_steps: int) -> None:
+        """Test, write a row, take a checkpoint."""
+        self.seconds += time.perf_counter() - self._clock
+        result = self.result = self._test(n_steps)
+        row = {STEPS: n_steps, SECONDS: round(self.seconds, 1), "eval/success_rate": result.success_rate}
+        row |= {"eval/n_pairs": len(result.pairs), **{k: round(v, 6) for k, v in self.learner.summary().items()}}
+        self.rows.append(row)
+        text = io.StringIO()
+        writer = csv.DictWriter(text, list(self.rows[-1]), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(self.rows)
+        write_atomically(self.folder / PROGRESS, text.getvalue())
+        if self.learner.resumable:
+            self._save(n_steps)
+        self._clock = time.perf_counter()
+
+    def _test(self, n_steps: int) -> PairsResult:
+        spec = self.spec
+        n_pairs = spec.final_pairs if n_steps >= spec.steps else spec.pairs
+        return evaluate_pairs(
+            self.learner.policy, spec.env_id, env_kwargs=spec.env_kwargs, n_pairs=n_pairs, seed=spec.seed + 1000
+        )
+
+    def _save(self, n_steps: int) -> None:
+        before = checkpoints(self.folder)
+        partial = self.folder / "checkpoint.partial"
+        shutil.rmtree(partial, ignore_errors=True)
+        partial.mkdir()
+        self.learner.save(partial)
+        partial.rename(self.folder / f"checkpoint_{n_steps}")
+        for path in before.values():
+            shutil.rmtree(path)
+
+
+def checkpoints(folder: Path) -> dict[int, Path]:
+    """Find a run's checkpoints.
+
+    :param folder: of the run
+    :return: by the number of steps
+    """
+    found = (path for path in folder.glob("checkpoint_*") if path.is_dir())
+    return {int(path.name.partition("_")[2]): path for path in found}
+
+
+def read_progress(folder: Path) -> list[dict[str, Any]]:
+    """Read a run's rows.
+
+    :param folder: of the run
+    """
+    path = folder / PROGRESS
+    if not path.exists():
+        return []
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def write_atomically(path: Path, text: str) -> None:
+    """Write a file that is either as it was or complete, whatever happens.
+
+    :param path: the file
+    :param text: what it is to hold
+    """
+    partial = path.with_name(f"{path.name}.partial")
+    with partial.open("w") as file:
+        file.write(text)
+        file.flush()
+        os.fsync(file.fileno())
+    partial.replace(path)
+
+
+def status(specs: Sequence[RunSpec], out: Path) -> list[RunStatus]:
+    """Tell how runs stand.
+
+    :param specs: the runs
+    :param out: folder for all of them
+    """
+    return [_status(spec, spec.folder(out)) for spec in specs]
+
+
+def _status(spec: RunSpec, folder: Path) -> RunStatus:
+    rows = read_progress(folder)
+    steps = int(rows[-1][STEPS]) if rows else 0
+    rate = float(rows[-1]["eval/success_rate"]) if rows else None
+    if (folder / DONE).exists():
+        return RunStatus(spec, "done", steps, 0.0, rate)
+    left = float(rows[-1][SECONDS]) / steps * (spec.steps - steps) if rows else None
+    if _is_locked(folder):
+        return RunStatus(spec, "running", steps, left, rate)
+    if (folder / ERROR).exists():
+        return RunStatus(spec, "failed", steps, left, rate)
+    return RunStatus(spec, "stopped" if (folder / CONFIG).exists() else "waiting", steps, left, rate)
+
+
+def _is_locked(folder: Path) -> bool:
+    if not (folder / LOCK).exists():
+        return False
+    try:
+        with FileLock(folder / LOCK, timeout=0):
+            return False
+    except Timeout:
+        return True

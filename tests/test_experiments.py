@@ -1,0 +1,235 @@
+"""Many runs on disk: what is skipped, resumed, refused and reported."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from conftest import TOY
+from filelock import FileLock
+
+from sb3_skillgraph.experiments import RunSpec, compare, load_plan, run, status
+from sb3_skillgraph.experiments.runner import checkpoints, read_progress
+
+SMALL_NETS = {
+    "policy_kwargs": {"net_arch": [16, 16]},
+    "batch_size": 32,
+    "learning_starts": 100,
+    "train_freq": 1,
+    "option_timeout": 50,
+    "salient_event_freq": 3,
+    "event_reach": 10,
+}
+
+
+def spec(algorithm: str = "skill_graph", steps: int = 600, **changes: Any) -> RunSpec:
+    arguments = SMALL_NETS if algorithm == "skill_graph" else {}
+    values: dict[str, Any] = dict(check_every=200, pairs=3, final_pairs=4, arguments=arguments, seed=0)
+    return RunSpec(algorithm, "toy", algorithm=algorithm, env_id=TOY, steps=steps, **{**values, **changes})
+
+
+def progress(folder: Path) -> list[dict[str, str]]:
+    return [{name: value for name, value in row.items() if name != "time/seconds"} for row in read_progress(folder)]
+
+
+def plan(path: Path, **changes: Any) -> Path:
+    document = {
+        "methods": {"dsg": {"algorithm": "skill_graph", "arguments": SMALL_NETS}, "walk": {"algorithm": "random_walk"}},
+        "environments": {"toy": {"id": TOY, "steps": 400}},
+        "seeds": [0, 1],
+        "check_every": 200,
+        "pairs": 2,
+        "final_pairs": 3,
+        **changes,
+    }
+    path.write_text(yaml.safe_dump(document))
+    return path
+
+
+# -- one run ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("algorithm", ["skill_graph", "uvfa", "her", "covering_options", "random_walk"])
+def test_a_run_leaves_everything_and_is_not_done_again(algorithm: str, tmp_path: Path) -> None:
+    arguments = {"covering_options": {"n_options": 2, "option_updates": 20}}
+    this = spec(algorithm, steps=400, **({"arguments": arguments[algorithm]} if algorithm in arguments else {}))
+    assert run(this, tmp_path) == "done", (this.folder(tmp_path) / "error.txt").read_text()
+    folder = this.folder(tmp_path)
+    assert folder == tmp_path / "toy" / algorithm / "seed0"
+    config = json.loads((folder / "config.json").read_text())
+    assert config["steps"] == 400
+    assert config["versions"]["sb3_skillgraph"]
+    assert [row["time/total_timesteps"] for row in progress(folder)] == (
+        ["400"] if algorithm == "random_walk" else ["200", "400"]
+    )
+    done = json.loads((folder / "done.json").read_text())
+    assert len(done["pairs"]) == 4
+    assert done["success_rate"] == pytest.approx(sum(pair["success"] for pair in done["pairs"]) / 4)
+    assert not list(folder.glob("*.partial"))
+    before = {path: path.stat().st_mtime_ns for path in folder.rglob("*") if path.name != "lock"}
+    assert run(this, tmp_path) == "skipped"
+    assert {path: path.stat().st_mtime_ns for path in folder.rglob("*") if path.name != "lock"} == before
+
+
+class Killed(BaseException):
+    """What no error handling catches."""
+
+
+def test_a_run_goes_on_where_its_checkpoint_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from sb3_skillgraph.experiments import runner
+
+    alone, interrupted = tmp_path / "alone", tmp_path / "interrupted"
+    assert run(spec(), alone) == "done"
+    save = runner._Run._save
+
+    def killed_before(self: Any, n_steps: int) -> None:
+        if n_steps == 400:
+            raise Killed
+        save(self, n_steps)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(runner._Run, "_save", killed_before)
+        with pytest.raises(Killed):
+            run(spec(), interrupted)
+    folder = spec().folder(interrupted)
+    assert list(checkpoints(folder)) == [200]
+    assert len(progress(folder)) == 2  # the row that belongs to no checkpoint is dropped
+    (folder / "checkpoint.partial").mkdir()
+    (folder / "checkpoint.partial" / "agent.zip").write_text("half")
+    assert status([spec()], interrupted)[0].state == "stopped"
+    assert run(spec(), interrupted) == "done"
+    assert progress(folder) == progress(spec().folder(alone))
+    assert list(checkpoints(folder)) == [600]
+
+
+def test_others_begin_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from sb3_skillgraph.experiments import runner
+
+    def killed(self: Any, n_steps: int) -> Any:
+        if n_steps == 400:
+            raise Killed
+        return test(self, n_steps)
+
+    test = runner._Run._test
+    with monkeypatch.context() as patch:
+        patch.setattr(runner._Run, "_test", killed)
+        with pytest.raises(Killed):
+            run(spec("uvfa"), tmp_path)
+    assert run(spec("uvfa"), tmp_path) == "done"
+    assert [row["time/total_timesteps"] for row in progress(spec("uvfa").folder(tmp_path))] == ["200", "400", "600"]
+
+
+def test_an_error_is_kept_and_the_run_tried_again(tmp_path: Path) -> None:
+    broken = spec(arguments={"gamma": "much"})
+    assert run(broken, tmp_path) == "failed"
+    assert "Error" in (broken.folder(tmp_path) / "error.txt").read_text()
+    assert status([broken], tmp_path)[0].state == "failed"
+    assert run(spec(), tmp_path) == "failed"
+    assert "another configuration" in (broken.folder(tmp_path) / "error.txt").read_text()
+
+
+def test_a_run_that_another_worker_does_is_left_to_it(tmp_path: Path) -> None:
+    folder = spec().folder(tmp_path)
+    folder.mkdir(parents=True)
+    with FileLock(folder / "lock"):
+        assert run(spec(), tmp_path) == "elsewhere"
+        assert status([spec()], tmp_path)[0].state == "running"
+    assert status([spec()], tmp_path)[0].state == "waiting"
+
+
+# -- many runs --------------------------------------------------------------------------------------------------------
+
+
+def test_on_loky(tmp_path: Path) -> None:
+    specs = load_plan(plan(tmp_path / "plan.yml"))
+    assert [(s.method, s.seed) for s in specs] == [("dsg", 0), ("walk", 0), ("dsg", 1), ("walk", 1)]
+    assert compare(specs, tmp_path / "runs", n_jobs=2) == ["done"] * 4
+    assert compare(specs, tmp_path / "runs", n_jobs=2) == ["skipped"] * 4
+    assert {s.state for s in status(specs, tmp_path / "runs")} == {"done"}
+
+
+def test_on_ray(tmp_path: Path) -> None:
+    ray = pytest.importorskip("ray")
+    ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False)
+    try:
+        specs = load_plan(plan(tmp_path / "plan.yml", methods={"walk": {"algorithm": "random_walk"}}))
+        assert compare(specs, tmp_path / "runs", n_jobs=2, backend="ray") == ["done"] * 2
+    finally:
+        ray.shutdown()
+
+
+WORKER = """
+import os, signal, sys
+from pathlib import Path
+from sb3_skillgraph.agent import SkillGraphAgent
+from sb3_skillgraph.experiments import compare, load_plan
+
+store, left = SkillGraphAgent._store_transition, int(sys.argv[3])
+
+def killed_in_time(self, *arguments):
+    global left
+    left -= 1
+    if left == 0:
+        os.kill(os.getpid(), signal.SIGKILL)
+    store(self, *arguments)
+
+SkillGraphAgent._store_transition = killed_in_time
+compare(load_plan(Path(sys.argv[1])), Path(sys.argv[2]))
+"""
+
+
+def work(plan_file: Path, out: Path, steps_to_live: int = 0) -> subprocess.Popen[bytes]:
+    command = [sys.executable, "-c", WORKER, str(plan_file), str(out), str(steps_to_live)]
+    return subprocess.Popen(command, env={**os.environ, "OMP_NUM_THREADS": "1"})
+
+
+def test_killed_at_any_moment_it_comes_to_the_same_and_two_workers_share(tmp_path: Path) -> None:
+    methods = {"dsg": {"algorithm": "skill_graph", "arguments": SMALL_NETS}}
+    file = plan(tmp_path / "plan.yml", methods=methods, environments={"toy": {"id": TOY, "steps": 700}}, check_every=100)
+    specs, alone, shared = load_plan(file), tmp_path / "alone", tmp_path / "shared"
+    compare(specs, alone)
+    for steps_to_live in np.random.default_rng(0).integers(120, 300, 5).tolist():
+        assert work(file, shared, steps_to_live).wait() == -signal.SIGKILL
+    assert {s.state for s in status(specs, shared)} != {"done"}
+    workers = [work(file, shared) for _ in range(2)]
+    assert [worker.wait() for worker in workers] == [0, 0]
+    for s in specs:
+        assert (s.folder(shared) / "done.json").exists()
+        assert progress(s.folder(shared)) == progress(s.folder(alone))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"methods": {"dsg": {"algorithm": "skil_graph"}}}, "unknown algorithm 'skil_graph'.*'skill_graph'"),
+        ({"methods": {"dsg": {"algorithm": "skill_graph", "arguments": {"gama": 1}}}}, "unknown argument 'gama'"),
+        ({"methods": {}}, "methods is missing"),
+        ({"seeds": 3}, "seeds must be a list, not 3"),
+        ({"check_every": 0}, "check_every must be a positive number, not 0"),
+        ({"sedes": [1]}, "unknown entry 'sedes'"),
+        ({"environments": {"toy": {"id": TOY}}}, "environment 'toy': steps is missing"),
+        ({"environments": {"toy": {"id": TOY, "steps": 5, "methods": ["dgs"]}}}, "unknown method 'dgs'"),
+        ({"environments": ["toy"]}, "environments must be a mapping"),
+    ],
+)
+def test_what_a_plan_must_not_say(changes: dict[str, Any], message: str, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=message):
+        load_plan(plan(tmp_path / "plan.yml", **changes))
+
+
+def test_a_plan_that_is_no_yaml(tmp_path: Path) -> None:
+    (tmp_path / "plan.yml").write_text("methods: [")
+    with pytest.raises(ValueError, match="no valid YAML"):
+        load_plan(tmp_path / "plan.yml")
+
+
+def test_an_unknown_backend_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "ray.util.joblib", None)
+    with pytest.raises(ValueError, match="pip install ray"):
+        compare([], tmp_path, backend="ray")
