@@ -175,7 +175,7 @@ class SkillGraphAgent(Assembly):
         off_policy_runs: bool = True,
         containment: float = 0.9,
         evidence_edges: bool = True,
-        rate_prior: tuple[float, float] = (1.6, 0.4),
+        rate_prior: tuple[float, float] = (1.9, 0.1),
         min_success_rate: float = 0.3,
         failure_cost: float = 5.0,
         nearest: Literal["steps", "euclidean"] = "steps",

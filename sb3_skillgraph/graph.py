@@ -58,7 +58,7 @@ class SkillGraph:
         self,
         goal_dim: int,
         containment: float = 0.9,
-        rate_prior: tuple[float, float] = (1.6, 0.4),
+        rate_prior: tuple[float, float] = (1.9, 0.1),
         evidence_edges: bool = True,
         min_success_rate: float = 0.3,
         failure_cost: float = 5.0,
