@@ -1,10 +1,9 @@
-"""The command line: ``sb3-skillgraph train | evaluate | plot | demo``."""
+"""The command line: ``sb3-skillgraph train | evaluate | plot | demo | compare | status | figure``."""
 
 import argparse
 import json
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NoReturn
@@ -12,7 +11,6 @@ from typing import Any, NoReturn
 import gymnasium as gym
 import numpy as np
 import torch as th
-import yaml
 from rich.console import Console
 from rich.table import Table
 from stable_baselines3.common.env_util import make_vec_env
@@ -22,17 +20,15 @@ import sb3_skillgraph.envs  # noqa: F401 - registers the environments
 from sb3_skillgraph.agent import SkillGraphAgent
 from sb3_skillgraph.baselines import RandomWalk
 from sb3_skillgraph.callbacks import SkillGraphProgressBarCallback
+from sb3_skillgraph.console import UserError, assignment, for_people, positive
 from sb3_skillgraph.evaluation import PairsResult, evaluate_pairs
+from sb3_skillgraph.experiments.commands import add_compare, add_figure, add_status
 from sb3_skillgraph.hyperparams import check_hyperparams, did_you_mean, load_hyperparams
 from sb3_skillgraph.plotting import plot_plan, plot_skill_graph, run_plan, save_figure
 
 DEMO_ENV, DEMO_STEPS, DEMO_PAIRS = "SkillGraph/PointMazeMedium-v0", 100_000, 100
 USER_ERROR, INTERRUPTED = 2, 130
 _VERSIONS_OF = ("sb3_skillgraph", "stable_baselines3", "torch", "gymnasium", "gymnasium_robotics", "mujoco", "numpy")
-
-
-class UserError(Exception):
-    """Something the user can put right; shown as one line, without a traceback."""
 
 
 class _Parser(argparse.ArgumentParser):
@@ -43,23 +39,6 @@ class _Parser(argparse.ArgumentParser):
 
 
 # -- arguments ---------------------------------------------------------------------------------------------------------
-
-
-def _positive(text: str) -> int:
-    number = int(text.replace("_", ""))
-    if number < 1:
-        raise argparse.ArgumentTypeError(f"must be at least 1, not {number}")
-    return number
-
-
-def _assignment(text: str) -> tuple[str, Any]:
-    name, equals, value = text.partition("=")
-    if not (name and equals):
-        raise argparse.ArgumentTypeError(f"{text!r} is not of the form NAME=VALUE")
-    try:
-        return name, yaml.safe_load(value)
-    except yaml.YAMLError as error:
-        raise argparse.ArgumentTypeError(f"the value of {name} is no valid YAML: {value!r}") from error
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -77,6 +56,9 @@ def build_parser() -> argparse.ArgumentParser:
     _add_evaluate(commands)
     _add_plot(commands)
     _add_demo(commands)
+    add_compare(commands)
+    add_status(commands)
+    add_figure(commands)
     return parser
 
 
@@ -93,7 +75,7 @@ def _add_env_kwargs(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--env-kwargs",
         nargs="+",
-        type=_assignment,
+        type=assignment,
         default=[],
         metavar="NAME=VALUE",
         help="arguments of the environment, values in YAML: maze_map=[[1,1,1],[1,0,1],[1,1,1]]",
@@ -112,15 +94,15 @@ def _add_train(commands: Any) -> None:
         "  sb3-skillgraph train SkillGraph/ToyMaze-v0 --hyperparams salience=rrt policy_kwargs='{net_arch: [64, 64]}'",
     )
     command.add_argument("env", metavar="ENV", help="environment id; 'package:Name-v0' imports the package first")
-    command.add_argument("--steps", type=_positive, help="environment steps (default: the environment's entry)")
+    command.add_argument("--steps", type=positive, help="environment steps (default: the environment's entry)")
     command.add_argument("--out", type=Path, help="folder for the results (default: runs/<environment>-seed<seed>)")
-    command.add_argument("--n-envs", type=_positive, default=1, help="copies of the environment (default: 1)")
+    command.add_argument("--n-envs", type=positive, default=1, help="copies of the environment (default: 1)")
     command.add_argument("--device", default="auto", help="torch device: auto, cpu, cuda (default: auto)")
     command.add_argument("--verbose", action="store_true", help="print SB3's table as well as the progress bar")
     command.add_argument(
         "--hyperparams",
         nargs="+",
-        type=_assignment,
+        type=assignment,
         default=[],
         metavar="NAME=VALUE",
         help="arguments of SkillGraphAgent, values in YAML",
@@ -139,8 +121,8 @@ def _add_evaluate(commands: Any) -> None:
     )
     command.add_argument("agent", type=Path, metavar="AGENT.zip", help="what train saved")
     command.add_argument("--env", required=True, metavar="ENV", help="environment id")
-    command.add_argument("--pairs", type=_positive, default=100, help="pairs of start and goal (default: 100)")
-    command.add_argument("--adapt", type=_positive, default=0, metavar="STEPS", help="steps of adaptation per pair")
+    command.add_argument("--pairs", type=positive, default=100, help="pairs of start and goal (default: 100)")
+    command.add_argument("--adapt", type=positive, default=0, metavar="STEPS", help="steps of adaptation per pair")
     command.add_argument("--no-planning", action="store_true", help="walk straight to goals by the global option")
     command.add_argument("--out", type=Path, metavar="FILE.json", help="write every pair to this file")
     _add_env_kwargs(command)
@@ -171,10 +153,8 @@ def _add_demo(commands: Any) -> None:
         "progress.csv, config.json, results.json, skill_graph.png and plan.png. A few minutes on two cores.\n\n"
         "example:\n  sb3-skillgraph demo --out runs/demo",
     )
-    command.add_argument("--steps", type=_positive, default=DEMO_STEPS, help=f"environment steps (default: {DEMO_STEPS})")
-    command.add_argument(
-        "--pairs", type=_positive, default=DEMO_PAIRS, help=f"pairs of start and goal (default: {DEMO_PAIRS})"
-    )
+    command.add_argument("--steps", type=positive, default=DEMO_STEPS, help=f"environment steps (default: {DEMO_STEPS})")
+    command.add_argument("--pairs", type=positive, default=DEMO_PAIRS, help=f"pairs of start and goal (default: {DEMO_PAIRS})")
     command.add_argument("--out", type=Path, default=Path("runs/demo"), help="folder for the results (default: runs/demo)")
 
 
@@ -186,7 +166,7 @@ def _train(args: argparse.Namespace) -> int:
     out = args.out or Path("runs") / f"{args.env.rpartition('/')[2]}-seed{args.seed}"
     if (out / "agent.zip").exists():
         raise UserError(f"{out} holds an agent already; give another folder with --out, or remove it.")
-    with _for_people():
+    with for_people():
         given = check_hyperparams(dict(args.hyperparams), "--hyperparams")
         hyperparams = {**load_hyperparams(args.env), **given}
     steps = args.steps or int(hyperparams["n_timesteps"])
@@ -208,10 +188,10 @@ def _learn(
 ) -> SkillGraphAgent:
     """Train, and leave agent, log and configuration in a folder; Ctrl-C saves what there is and is raised again."""
     arguments = {name: value for name, value in hyperparams.items() if name != "n_timesteps"}
-    with _for_people():
+    with for_people():
         env = make_vec_env(env_id, n_envs=n_envs, env_kwargs=env_kwargs)
     try:
-        with _for_people():
+        with for_people():
             agent = SkillGraphAgent(env=env, seed=seed, **{"device": device, **arguments})
         out.mkdir(parents=True, exist_ok=True)
         config = dict(env=env_id, env_kwargs=env_kwargs, steps=steps, seed=seed, n_envs=n_envs, arguments=arguments)
@@ -302,22 +282,13 @@ def _check_env_id(env_id: str) -> None:
 
 def _make_env(env_id: str, env_kwargs: dict[str, Any]) -> gym.Env:
     _check_env_id(env_id)
-    with _for_people():
+    with for_people():
         return gym.make(env_id, **env_kwargs)
 
 
 def _load(path: Path, env: gym.Env) -> SkillGraphAgent:
-    with _for_people():
+    with for_people():
         return SkillGraphAgent.load(path, env=env)
-
-
-@contextmanager
-def _for_people() -> Iterator[None]:
-    """Say in one line what the library refuses; for the steps that check what the user gave, and for no others."""
-    try:
-        yield
-    except (ValueError, TypeError, RuntimeError, gym.error.Error) as error:
-        raise UserError(str(error)) from error
 
 
 def _draw(

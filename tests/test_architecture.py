@@ -40,6 +40,7 @@ FLOORS: dict[str, float] = {
     "callbacks": 6,
     "baselines": 6,
     "plotting": 7,
+    "console": 7,
     "hyperparams": 7.5,
     "experiments": 8,
     "cli": 9,

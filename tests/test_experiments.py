@@ -13,9 +13,13 @@ import pytest
 import yaml
 from conftest import TOY
 from filelock import FileLock
+from imageio.v3 import imread
 
-from sb3_skillgraph.experiments import RunSpec, compare, load_plan, run, status
+from sb3_skillgraph.cli import main
+from sb3_skillgraph.experiments import RunSpec, compare, load_plan, run, runner, status
+from sb3_skillgraph.experiments.figures import method_curves
 from sb3_skillgraph.experiments.runner import checkpoints, read_progress
+from sb3_skillgraph.experiments.summary import estimate, interquartile_mean
 
 SMALL_NETS = {
     "policy_kwargs": {"net_arch": [16, 16]},
@@ -48,7 +52,7 @@ def plan(path: Path, **changes: Any) -> Path:
         "final_pairs": 3,
         **changes,
     }
-    path.write_text(yaml.safe_dump(document))
+    path.write_text(yaml.safe_dump(document, sort_keys=False))
     return path
 
 
@@ -82,8 +86,6 @@ class Killed(BaseException):
 
 
 def test_a_run_goes_on_where_its_checkpoint_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from sb3_skillgraph.experiments import runner
-
     alone, interrupted = tmp_path / "alone", tmp_path / "interrupted"
     assert run(spec(), alone) == "done"
     save = runner._Run._save
@@ -109,8 +111,6 @@ def test_a_run_goes_on_where_its_checkpoint_is(tmp_path: Path, monkeypatch: pyte
 
 
 def test_others_begin_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from sb3_skillgraph.experiments import runner
-
     def killed(self: Any, n_steps: int) -> Any:
         if n_steps == 400:
             raise Killed
@@ -233,3 +233,82 @@ def test_an_unknown_backend_says_what_to_install(tmp_path: Path, monkeypatch: py
     monkeypatch.setitem(sys.modules, "ray.util.joblib", None)
     with pytest.raises(ValueError, match="pip install ray"):
         compare([], tmp_path, backend="ray")
+
+
+# -- estimates and figures --------------------------------------------------------------------------------------------
+
+
+def test_interquartile_mean_and_its_interval() -> None:
+    assert interquartile_mean(np.array([0.0, 0.4, 0.6, 1.0])) == pytest.approx(0.5)
+    scores = np.random.default_rng(0).normal(0.5, 0.1, (3, 40))
+    mean, low, high = estimate(scores)
+    assert mean == interquartile_mean(scores)
+    assert low < mean < high
+    assert 0.02 < high - low < 0.08
+    assert estimate(np.full((2, 5), 0.7)) == pytest.approx((0.7, 0.7, 0.7))
+    # Strata: an environment where all seeds agree adds no uncertainty, whatever its level.
+    one, both = estimate(scores[:1]), estimate(np.stack([scores[0], np.full(40, 0.5)]))
+    assert both.high - both.low < one.high - one.low
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    folder = tmp_path_factory.mktemp("compare")
+    methods = {
+        "frontier": {"algorithm": "skill_graph", "arguments": SMALL_NETS},
+        "dco": {"algorithm": "skill_graph", "arguments": {**SMALL_NETS, "salience": "dco", "retry_after": 50}},
+        "walk": {"algorithm": "random_walk"},
+    }
+    toy = {"toy": {"id": TOY, "steps": 1600}}
+    file = plan(folder / "plan.yml", methods=methods, environments=toy, seeds=[1], check_every=400)
+    assert compare(load_plan(file), folder / "runs", n_jobs=2) == ["done"] * 3
+    return file, folder / "runs"
+
+
+@pytest.mark.parametrize("number", [3, 4, 5, 6, 7, 9])
+def test_figures_of_the_paper(number: int, runs: tuple[Path, Path], tmp_path: Path) -> None:
+    file, out = runs
+    picture = tmp_path / "figure.png"
+    assert main(["figure", str(number), str(file), "--out", str(out), "--to", str(picture)]) == 0
+    image = imread(picture)
+    assert image.shape[0] > 300
+    assert image[..., :3].std() > 10
+    before = picture.read_bytes()
+    assert main(["figure", str(number), str(file), "--out", str(out), "--to", str(picture)]) == 0
+    assert picture.read_bytes() == before
+
+
+def test_curves_are_the_seeds_rows(runs: tuple[Path, Path]) -> None:
+    specs = load_plan(runs[0])
+    curves = method_curves(specs, runs[1])
+    assert list(curves) == ["frontier", "dco", "walk"]
+    rows = read_progress(specs[0].folder(runs[1]))
+    assert curves["frontier"].steps.tolist() == [400, 800, 1200, 1600]
+    assert curves["frontier"].mean.tolist() == pytest.approx([float(row["eval/success_rate"]) for row in rows])
+    assert curves["walk"].steps.tolist() == [0, 1600]
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["figure", "2"], "no Figure 2"),
+        (["figure", "5", "--method", "frontire"], "no method 'frontire'; it has frontier, dco, walk"),
+        (["figure", "3", "--method", "walk"], "needs a finished run of a skill graph"),
+        (["figure", "9", "--method", "frontier"], "with salience=dco"),
+    ],
+)
+def test_what_cannot_be_drawn(
+    words: list[str], message: str, runs: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = [*words[:2], str(runs[0]), *words[2:], "--out", str(runs[1]), "--to", str(tmp_path / "x.png")]
+    assert main(command) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_compare_and_status_on_the_command_line(runs: tuple[Path, Path], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["compare", str(runs[0]), "--out", str(runs[1])]) == 0
+    assert "3 skipped" in capsys.readouterr().out
+    assert main(["status", str(runs[0]), "--out", str(runs[1])]) == 0
+    assert "1/1" in capsys.readouterr().out
+    assert main(["status", "nowhere.yml", "--out", str(runs[1])]) == 2
+    assert "there is no plan nowhere.yml" in capsys.readouterr().err

@@ -13,6 +13,7 @@ from sb3_skillgraph.agent import SkillGraphAgent
 from sb3_skillgraph.baselines import CoveringOptions, RandomWalk, make_her, make_uvfa
 from sb3_skillgraph.evaluation import Predictor
 from sb3_skillgraph.hyperparams import check_hyperparams, load_hyperparams
+from sb3_skillgraph.plotting import event_links, near_links
 
 Check = Callable[[int], None]
 
@@ -59,6 +60,10 @@ class Learner(ABC):
         """Return what else is worth a column."""
         return {}
 
+    def snapshot(self) -> dict[str, Any] | None:
+        """Return what is worth a picture, as plain data."""
+        return None
+
 
 class SkillGraphLearner(Learner):
     """Deep Skill Graphs; episodes do not end at goals, and there is no reward."""
@@ -91,6 +96,16 @@ class SkillGraphLearner(Learner):
     def summary(self) -> dict[str, float]:
         """Describe the graph."""
         return {f"skillgraph/{name}": value for name, value in self.policy.graph_summary().items()}
+
+    def snapshot(self) -> dict[str, Any]:
+        """Return events and what joins them."""
+        graph = self.policy.graph
+        numbers = {id: i for i, id in enumerate(graph.events)}
+        links = near_links(event_links(graph))
+        return {
+            "centers": [event.center.tolist() for event in graph.events.values()],
+            "links": [[numbers[link.source], numbers[link.target]] for link in links],
+        }
 
 
 class _Checks(BaseCallback):

@@ -115,7 +115,14 @@ class _Run:
             "interval": result.interval,
             "seconds": round(self.seconds, 1),
             "pairs": [
-                {"path_length": round(p.path_length, 3), "success": bool(p.success), "steps": p.steps} for p in result.pairs
+                {
+                    "start": p.start.round(3).tolist(),
+                    "goal": p.goal.round(3).tolist(),
+                    "path_length": round(p.path_length, 3),
+                    "success": bool(p.success),
+                    "steps": p.steps,
+                }
+                for p in result.pairs
             ],
             **self.learner.summary(),
         }
@@ -153,6 +160,10 @@ class _Run:
         writer.writeheader()
         writer.writerows(self.rows)
         write_atomically(self.folder / PROGRESS, text.getvalue())
+        snapshot = self.learner.snapshot()
+        if snapshot is not None:
+            document = json.dumps({"steps": n_steps, **snapshot})
+            write_atomically(self.folder / f"graph_{n_steps}.json", document + "\n")
         if self.learner.resumable:
             self._save(n_steps)
         self._clock = time.perf_counter()

@@ -1,0 +1,147 @@
+"""The commands ``compare``, ``status`` and ``figure``."""
+
+import argparse
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from sb3_skillgraph.console import UserError, for_people, positive
+from sb3_skillgraph.experiments.figures import redraw
+from sb3_skillgraph.experiments.plan import RunSpec, load_plan
+from sb3_skillgraph.experiments.runner import ERROR, RunStatus, compare, status
+from sb3_skillgraph.experiments.summary import estimate
+from sb3_skillgraph.plotting import save_figure
+
+
+def add_compare(commands: Any) -> None:
+    """Add ``compare``.
+
+    :param commands: argparse's sub-parsers
+    """
+    command = _add(
+        commands,
+        "compare",
+        _compare,
+        "Run methods on environments with several seeds; what is done is skipped, what was killed goes on.",
+        "PLAN names methods, environments and seeds (benchmarks/compare.yml is one). Several of these may work in one OUT.\n\n"
+        "example:\n  sb3-skillgraph compare benchmarks/compare.yml --out runs/compare --jobs 2",
+    )
+    command.add_argument("--jobs", type=positive, default=1, help="runs at a time (default: 1)")
+    command.add_argument(
+        "--backend", choices=("loky", "ray", "dask"), default="loky", help="what joblib runs them on (default: loky)"
+    )
+
+
+def add_status(commands: Any) -> None:
+    """Add ``status``.
+
+    :param commands: argparse's sub-parsers
+    """
+    _add(
+        commands,
+        "status",
+        _status,
+        "Show how the runs of a plan stand, and how long they will take.",
+        "example:\n  sb3-skillgraph status benchmarks/compare.yml --out runs/compare",
+    )
+
+
+def add_figure(commands: Any) -> None:
+    """Add ``figure``.
+
+    :param commands: argparse's sub-parsers
+    """
+    command = commands.add_parser(
+        "figure",
+        help="Redraw a figure of the paper from the runs of a plan.",
+        description="3 frontier and Fiedler values; 4 exploration; 5 learning curves; 6 growth of the graph; 7, 8 how sets "
+        "become edges; 9 where deep covering options fail.\n\n"
+        "example:\n  sb3-skillgraph figure 5 benchmarks/compare.yml --out runs/compare --to figure_5.png",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    command.set_defaults(run=_figure)
+    command.add_argument("number", type=int, metavar="N", help="3 to 9")
+    _add_plan(command)
+    command.add_argument("--environment", help="draw this one of the plan's environments (default: the first; 5 draws all)")
+    command.add_argument("--method", help="draw this one of the plan's methods (default: the first that fits)")
+    command.add_argument("--to", type=Path, required=True, metavar="FILE.png", help="the picture; .svg and .pdf work, too")
+
+
+def _add(commands: Any, name: str, run: Any, summary: str, detail: str) -> argparse.ArgumentParser:
+    command: argparse.ArgumentParser = commands.add_parser(
+        name, help=summary, description=f"{summary}\n\n{detail}", formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    command.set_defaults(run=run)
+    _add_plan(command)
+    return command
+
+
+def _add_plan(command: argparse.ArgumentParser) -> None:
+    command.add_argument("plan", type=Path, metavar="PLAN.yml", help="methods, environments and seeds")
+    command.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder of all runs")
+
+
+def _read(args: argparse.Namespace) -> list[RunSpec]:
+    if not args.plan.is_file():
+        raise UserError(f"there is no plan {args.plan}.")
+    with for_people():
+        return load_plan(args.plan)
+
+
+def _compare(args: argparse.Namespace) -> int:
+    specs = _read(args)
+    with for_people():
+        outcomes = compare(specs, args.out, args.jobs, args.backend)
+    _print_status(status(specs, args.out))
+    counts = Counter(outcomes)
+    print(", ".join(f"{n} {outcome}" for outcome, n in counts.items()))
+    for spec, outcome in zip(specs, outcomes, strict=True):
+        if outcome == "failed":
+            print(f"failed: see {spec.folder(args.out) / ERROR}")
+    return 1 if counts["failed"] else 0
+
+
+def _status(args: argparse.Namespace) -> int:
+    _print_status(status(_read(args), args.out))
+    return 0
+
+
+def _print_status(runs: list[RunStatus]) -> None:
+    table = Table()
+    for column in ("environment", "method", "done", "running", "failed", "success (IQM, 95 %)", "time left"):
+        table.add_column(column, justify="left" if column in ("environment", "method") else "right")
+    for environment, method in dict.fromkeys((run.spec.environment, run.spec.method) for run in runs):
+        here = [run for run in runs if (run.spec.environment, run.spec.method) == (environment, method)]
+        states = Counter(run.state for run in here)
+        scores = [run.success_rate for run in here if run.state == "done" and run.success_rate is not None]
+        success = "-"
+        if scores:
+            mean, low, high = estimate(np.array([scores]))
+            success = f"{mean:.2f} ({low:.2f} to {high:.2f})"
+        known = [run.seconds_left for run in here if run.seconds_left is not None and run.state != "done"]
+        waiting = sum(run.seconds_left is None for run in here)
+        left = f"{sum(known) / 60:.0f} min" + (f" and {waiting} to begin" if waiting else "")
+        table.add_row(
+            environment, method, f"{states['done']}/{len(here)}", str(states["running"]), str(states["failed"]), success, left
+        )
+    Console().print(table)
+
+
+def _figure(args: argparse.Namespace) -> int:
+    specs = _read(args)
+    for name, wanted in (("environment", args.environment), ("method", args.method)):
+        known = list(dict.fromkeys(getattr(spec, name) for spec in specs))
+        if wanted is not None and wanted not in known:
+            raise UserError(f"the plan has no {name} {wanted!r}; it has {', '.join(known)}.")
+        if wanted is not None:
+            specs = [spec for spec in specs if getattr(spec, name) == wanted]
+    if args.number != 5:
+        specs = [spec for spec in specs if spec.environment == specs[0].environment]
+    with for_people():
+        save_figure(redraw(args.number, specs, args.out), args.to)
+    print(f"the picture is {args.to}")
+    return 0

@@ -1,0 +1,249 @@
+"""The paper's figures, redrawn from stored runs."""
+
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+from matplotlib.axes import Axes
+
+from sb3_skillgraph.agent import SkillGraphAgent
+from sb3_skillgraph.baselines import RandomWalk
+from sb3_skillgraph.envs import MazeGeometry
+from sb3_skillgraph.experiments.plan import RunSpec
+from sb3_skillgraph.experiments.runner import DONE, STEPS, checkpoints, read_progress
+from sb3_skillgraph.experiments.summary import estimate
+from sb3_skillgraph.plotting import paper_figures as draw
+from sb3_skillgraph.salience.dco import learn_fiedler
+
+SHARES = (0.1, 0.3, 0.6, 1.0)  # of the run, at which it is looked at
+N_PAIRS = 20_000
+
+
+class MissingRunError(ValueError):
+    """What a figure needs is not there."""
+
+
+def redraw(number: int, specs: Sequence[RunSpec], out: Path) -> Axes:
+    """Redraw one of the paper's figures.
+
+    :param number: 3 to 9
+    :param specs: the runs it is drawn from: all of them for 5, the first that fits for the others
+    :param out: folder of all runs
+    :return: axes of the figure
+    :raises MissingRunError: if there is no such figure or no such run
+    """
+    figures: dict[int, Callable[[Sequence[RunSpec], Path], Axes]] = {
+        3: frontier,
+        4: exploration,
+        5: curves,
+        6: growth,
+        7: edge_between_options,
+        8: edge_between_chains,
+        9: failure_of_dco,
+    }
+    if number not in figures:
+        raise MissingRunError(f"There is no Figure {number} to redraw: it is one of 3 to 9.")
+    return figures[number](specs, out)
+
+
+# -- reading runs -----------------------------------------------------------------------------------------------------
+
+
+def _finished(specs: Sequence[RunSpec], out: Path, salience: str | None = None) -> list[RunSpec]:
+    """Find the finished runs of skill graphs, at least one."""
+    found = [
+        spec
+        for spec in specs
+        if spec.algorithm == "skill_graph"
+        and (salience is None or spec.arguments.get("salience", "frontier") == salience)
+        and (spec.folder(out) / DONE).exists()
+    ]
+    if not found:
+        kind = "of a skill graph" if salience is None else f"of a skill graph with salience={salience}"
+        raise MissingRunError(f"This figure needs a finished run {kind}, and {out} has none.")
+    return found
+
+
+def _agent(spec: RunSpec, out: Path) -> SkillGraphAgent:
+    saved = checkpoints(spec.folder(out))
+    if not saved:
+        raise MissingRunError(f"{spec.folder(out)} has no checkpoint any more.")
+    folder = saved[max(saved)]
+    agent = SkillGraphAgent.load(folder / "agent.zip", env=gym.make(spec.env_id, **spec.env_kwargs))
+    agent.load_replay_buffer(folder / "experience")
+    return agent
+
+
+def _geometry(spec: RunSpec) -> MazeGeometry:
+    env = gym.make(spec.env_id, **spec.env_kwargs)
+    geometry: MazeGeometry = env.get_wrapper_attr("geometry")
+    env.close()
+    return geometry
+
+
+def _visits(agent: SkillGraphAgent) -> np.ndarray:
+    rows = np.arange(agent.store.oldest, agent.store.total)
+    return agent.store.column("next_achieved_goal", rows)
+
+
+# -- figures ----------------------------------------------------------------------------------------------------------
+
+
+def frontier(specs: Sequence[RunSpec], out: Path) -> Axes:
+    """Figure 3: the frontier, and the Fiedler embedding's two ends on it, as training goes on."""
+    spec = _finished(specs, out)[0]
+    agent, geometry = _agent(spec, out), _geometry(spec)
+    panels = draw.new_panels(len(SHARES))
+    visits, store = _visits(agent), agent.store
+    for axes, share in zip(panels, SHARES, strict=True):
+        n_steps = int(share * len(visits))
+        store.total = store.oldest + n_steps  # what the agent knew then
+        embedding = learn_fiedler(store, agent._arguments["event_reach"], N_PAIRS, np.random.default_rng(0))
+        points = draw.thinned(visits[:n_steps])
+        values = embedding(points)
+        ends = points[[values.argmin(), values.argmax()]]
+        draw.plot_frontier(axes, points, values, ends, geometry, f"{n_steps:,} steps")
+    return panels[0]
+
+
+def exploration(specs: Sequence[RunSpec], out: Path) -> Axes:
+    """Figure 4: where the agent has been, and where a random walk gets in the same steps."""
+    spec = _finished(specs, out)[0]
+    visits, geometry = _visits(_agent(spec, out)), _geometry(spec)
+    walked = _random_walk(spec, len(visits))
+    panels = draw.new_panels(6, n_rows=2)
+    for name, points, row in ((spec.method, visits, panels[:3]), ("random walk", walked, panels[3:])):
+        for axes, share in zip(row, (0.1, 0.4, 1.0), strict=True):
+            n_steps = int(share * len(points))
+            draw.plot_visits(axes, points[:n_steps], geometry, f"{name}, {n_steps:,} steps")
+    return panels[0]
+
+
+def _random_walk(spec: RunSpec, n_steps: int) -> np.ndarray:
+    env = gym.make(spec.env_id, **spec.env_kwargs)
+    assert isinstance(env.action_space, gym.spaces.Box)
+    walk, points = RandomWalk(env.action_space, spec.seed), []
+    observation, _ = env.reset(seed=spec.seed)
+    for _ in range(n_steps):
+        observation, _, terminated, truncated, _ = env.step(walk.predict(observation)[0])
+        points.append(observation["achieved_goal"])
+        if terminated or truncated:
+            observation, _ = env.reset()
+    env.close()
+    return np.array(points)
+
+
+def curves(specs: Sequence[RunSpec], out: Path) -> Axes:
+    """Figure 5: success on unseen pairs of start and goal against training steps, a panel for each environment."""
+    labels = list(dict.fromkeys(spec.environment for spec in specs))
+    panels = draw.new_panels(len(labels))
+    found = False
+    for axes, label in zip(panels, labels, strict=True):
+        here = [spec for spec in specs if spec.environment == label]
+        found |= bool(by_method := method_curves(here, out))
+        n_seeds = len({spec.seed for spec in here})
+        draw.plot_curves(axes, by_method, f"{label} ({n_seeds} seeds)")
+    if not found:
+        raise MissingRunError(f"There are no results in {out} yet.")
+    panels[-1].legend(fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
+    return panels[0]
+
+
+def method_curves(specs: Sequence[RunSpec], out: Path) -> dict[str, draw.Curve]:
+    """Read the curves of every method on one environment; seeds that are not done yet are left out.
+
+    :param specs: runs on that environment
+    :param out: folder of all runs
+    """
+    result = {}
+    for method in dict.fromkeys(spec.method for spec in specs):
+        folders = [spec.folder(out) for spec in specs if spec.method == method]
+        rows = [read_progress(folder) for folder in folders if (folder / DONE).exists()]
+        if not rows:
+            continue
+        steps = [int(row[STEPS]) for row in rows[0]]
+        scores = np.array([[float(row["eval/success_rate"]) for row in seed] for seed in rows])
+        if len(steps) == 1:  # nothing to learn: the same from the beginning
+            steps, scores = [0, *steps], np.repeat(scores, 2, axis=1)
+        estimates = np.array([estimate(column[None]) for column in scores.T])
+        result[method] = draw.Curve(np.array(steps), *estimates.T)
+    return result
+
+
+def growth(specs: Sequence[RunSpec], out: Path) -> Axes:
+    """Figure 6: the graph as it grows."""
+    spec = _finished(specs, out)[0]
+    geometry = _geometry(spec)
+    snapshots = [
+        draw.GraphSnapshot(plain["steps"], np.array(plain["centers"]), [tuple(link) for link in plain["links"]])
+        for plain in (json.loads(path.read_text()) for path in spec.folder(out).glob("graph_*.json"))
+    ]
+    snapshots.sort(key=lambda snapshot: snapshot.steps)
+    if not snapshots:
+        raise MissingRunError(f"{spec.folder(out)} has no snapshots of its graph.")
+    chosen = sorted({round(share * (len(snapshots) - 1)) for share in (0.0, 0.15, 0.4, 1.0)})
+    panels = draw.new_panels(len(chosen))
+    for axes, index in zip(panels, chosen, strict=True):
+        draw.plot_growth(axes, snapshots[index], geometry)
+    return panels[0]
+
+
+def edge_between_options(specs: Sequence[RunSpec], out: Path) -> Axes:
+    """Figure 7: two options at one event, the effects of one inside the initiation set of the other."""
+    return _edge(specs, out, to_event=True)
+
+
+def edge_between_chains(specs: Sequence[RunSpec], out: Path) -> Axes:
+    """Figure 8: the same along a chain, where an option leads to another option."""
+    return _edge(specs, out, to_event=False)
+
+
+def _edge(specs: Sequence[RunSpec], out: Path, to_event: bool) -> Axes:
+    for spec in _finished(specs, out):
+        example = clearest_edge(_agent(spec, out), to_event)
+        if example is not None:
+            panels = draw.new_panels(2)
+            draw.plot_edge(panels, example, _geometry(spec))
+            return panels[0]
+    raise MissingRunError(f"No graph in {out} has an edge of that kind between two options.")
+
+
+def clearest_edge(agent: SkillGraphAgent, to_event: bool) -> draw.EdgeExample | None:
+    """Find the edge between two options that is easiest to see: a sure one between sets that overlap little.
+
+    :param agent: the agent
+    :param to_event: whether the first option is to lead to an event rather than to another option
+    :return: None if there is no such edge
+    """
+    graph, points = agent.graph, draw.thinned(agent.visited.points)
+    best, example = -np.inf, None
+    for source, target, data in graph.nx.edges(data=True):
+        if source not in graph.options or target not in graph.options:
+            continue
+        first, second = graph.options[source], graph.options[target]
+        if (first.target in graph.events) != to_event or len(first.effects) < 3:
+            continue
+        starts, mine = (points[option.initiation.optimistic(points)] for option in (second, first))
+        overlap = float(second.initiation.optimistic(mine).mean()) if len(mine) else 1.0
+        if data["success_rate"] - overlap > best:
+            best = data["success_rate"] - overlap
+            center = graph.events[first.target].center if first.target in graph.events else None
+            names = (source, str(first.target), target)
+            example = draw.EdgeExample(names, np.stack(first.effects), starts, mine, center, data["success_rate"])
+    return example
+
+
+def failure_of_dco(specs: Sequence[RunSpec], out: Path) -> Axes:
+    """Figure 9: where deep covering options find no events, beside the agent with another salience."""
+    panels = draw.new_panels(2)
+    for axes, salience in zip(panels, ("dco", "frontier"), strict=True):
+        spec = _finished(specs, out, salience)[0]
+        agent = _agent(spec, out)
+        pairs = json.loads((spec.folder(out) / DONE).read_text())["pairs"]
+        missed = np.array([pair["goal"] for pair in pairs if not pair["success"]]).reshape(-1, agent.graph.goal_dim)
+        centers = np.array([event.center for event in agent.events])
+        title = f"{spec.method}: {len(centers)} events, {len(missed)} of {len(pairs)} goals missed"
+        draw.plot_missed(axes, agent.visited.points, centers, missed, _geometry(spec), title)
+    return panels[0]

@@ -1,0 +1,204 @@
+"""The paper's figures from arrays: growth, exploration, learning curves, and how sets become edges."""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+
+from sb3_skillgraph.envs import MazeGeometry
+from sb3_skillgraph.plotting import figures
+
+_MAX_DOTS = 6_000
+
+
+class Curve(NamedTuple):
+    """Success against steps, with an interval; arrays of shape ``(n,)``."""
+
+    steps: np.ndarray
+    mean: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+
+
+class GraphSnapshot(NamedTuple):
+    """A skill graph at one moment.
+
+    :param steps: environment steps so far
+    :param centers: of the events, shape ``(n, goal_dim)``
+    :param links: pairs of events that options join, as rows of ``centers``
+    """
+
+    steps: int
+    centers: np.ndarray
+    links: list[tuple[int, int]]
+
+
+class EdgeExample(NamedTuple):
+    """Two options and the edge between them: the effects of the first lie where the second can start.
+
+    :param names: of the first option, the event or option it leads to, and the second option
+    :param effects: where the first has ended, shape ``(n, goal_dim)``
+    :param starts: visited states in the initiation set of the second, shape ``(m, goal_dim)``
+    :param first_starts: visited states in the initiation set of the first, shape ``(k, goal_dim)``
+    :param target: centre of the event the first leads to; None if it leads to an option
+    :param success_rate: of the edge
+    """
+
+    names: tuple[str, str, str]
+    effects: np.ndarray
+    starts: np.ndarray
+    first_starts: np.ndarray
+    target: np.ndarray | None
+    success_rate: float
+
+
+def new_panels(n_panels: int, n_rows: int = 1) -> list[Axes]:
+    """Make a figure of panels side by side.
+
+    :param n_panels: number of panels in all
+    :param n_rows: rows of them
+    """
+    n_columns = -(-n_panels // n_rows)
+    figure = Figure(figsize=(4.2 * n_columns, 4.3 * n_rows), layout="constrained")
+    panels = np.atleast_1d(figure.subplots(n_rows, n_columns)).ravel().tolist()
+    for spare in panels[n_panels:]:
+        spare.set_axis_off()
+    return panels[:n_panels]
+
+
+def thinned(points: np.ndarray) -> np.ndarray:
+    """Keep as many points as a picture can show.
+
+    :param points: shape ``(n, goal_dim)``
+    """
+    return points[:: max(1, -(-len(points) // _MAX_DOTS))]
+
+
+def plot_frontier(
+    axes: Axes, points: np.ndarray, values: np.ndarray, ends: np.ndarray, geometry: MazeGeometry | None, title: str
+) -> None:
+    """Colour what was visited by the Fiedler embedding, and mark its two ends (Figure 3).
+
+    :param axes: where to draw
+    :param points: visited states, shape ``(n, goal_dim)``
+    :param values: the embedding there, shape ``(n,)``
+    :param ends: where it is largest and smallest, shape ``(2, goal_dim)``
+    :param geometry: the maze
+    :param title: of the panel
+    """
+    figures.draw_floor(axes, geometry, points, 1.0)
+    x, y = figures.project(points).T
+    axes.scatter(x, y, c=values, s=3, cmap="Blues", vmin=values.min() - 0.4 * np.ptp(values), zorder=figures.Z_VISITED)
+    axes.plot(*figures.project(ends).T, "o", color=figures.EVENT, markersize=8, zorder=figures.Z_EVENT)
+    axes.set_title(title)
+
+
+def plot_visits(axes: Axes, points: np.ndarray, geometry: MazeGeometry | None, title: str) -> None:
+    """Draw visited states, later ones darker (Figure 4).
+
+    :param axes: where to draw
+    :param points: in order of time, shape ``(n, goal_dim)``
+    :param geometry: the maze
+    :param title: of the panel
+    """
+    figures.draw_floor(axes, geometry, points, 1.0)
+    shown = figures.project(thinned(points))
+    colours = colormaps["viridis_r"](np.linspace(0.0, 1.0, len(shown)))
+    axes.scatter(shown[:, 0], shown[:, 1], c=colours, s=3, zorder=figures.Z_VISITED)
+    axes.set_title(title)
+
+
+def plot_curves(axes: Axes, curves: Mapping[str, Curve], title: str, x_label: str = "environment steps") -> None:
+    """Draw success against steps for several methods (Figure 5).
+
+    :param axes: where to draw
+    :param curves: by method
+    :param title: of the panel
+    :param x_label: what the steps are
+    """
+    colours = colormaps["tab10"](range(10))
+    for (name, curve), colour in zip(curves.items(), colours, strict=False):
+        axes.plot(curve.steps, curve.mean, label=name, color=colour, marker="o", markersize=3)
+        axes.fill_between(curve.steps, curve.low, curve.high, color=colour, alpha=0.15, linewidth=0)
+    axes.set(title=title, xlabel=x_label, ylabel="success rate (interquartile mean)", ylim=(-0.02, 1.02))
+    axes.grid(alpha=0.3)
+
+
+def plot_growth(axes: Axes, snapshot: GraphSnapshot, geometry: MazeGeometry | None) -> None:
+    """Draw events and what joins them at one moment (Figure 6).
+
+    :param axes: where to draw
+    :param snapshot: the graph then
+    :param geometry: the maze
+    """
+    figures.draw_floor(axes, geometry, snapshot.centers, 1.0)
+    centers = figures.project(snapshot.centers)
+    for source, target in snapshot.links:
+        axes.plot(*centers[[source, target]].T, color="#3182bd", linewidth=1.0, zorder=figures.Z_LINK)
+    axes.plot(*centers.T, "o", color=figures.EVENT, markersize=5, zorder=figures.Z_EVENT)
+    n_joined = len({frozenset(link) for link in snapshot.links})
+    axes.set_title(f"{snapshot.steps:,} steps: {len(centers)} events, {n_joined} joined pairs")
+
+
+def plot_edge(axes: Sequence[Axes], example: EdgeExample, geometry: MazeGeometry | None) -> None:
+    """Draw the sets behind an edge, and the edge (Figures 7 and 8).
+
+    :param axes: one panel for the maze, one for the graph
+    :param example: the edge
+    :param geometry: the maze
+    """
+    first, target, second = example.names
+    floor, graph = axes
+    everything = np.concatenate([example.starts, example.first_starts, example.effects])
+    figures.draw_floor(floor, geometry, everything, 1.0)
+    for points, colour in ((example.first_starts, "#c7c7c7"), (example.starts, "#74c476")):
+        floor.plot(*figures.project(points).T, "s", color=colour, markersize=3, alpha=0.7, zorder=figures.Z_REGION)
+    floor.plot(*figures.project(example.effects).T, "x", color="#d7301f", markersize=5, zorder=figures.Z_EFFECT)
+    if example.target is not None:
+        floor.plot(*figures.project(example.target[None]).T, "o", color="#2171b5", markersize=9, zorder=figures.Z_EVENT)
+    floor.legend(
+        handles=[
+            Patch(color="#c7c7c7", label=f"initiation set of {first}"),
+            Patch(color="#d7301f", label=f"effect set of {first}, which leads to {target}"),
+            Patch(color="#74c476", label=f"initiation set of {second}"),
+        ],
+        loc="upper center",
+        bbox_to_anchor=(0.5, -0.12),
+        fontsize=8,
+        frameon=False,
+    )
+    floor.set_title(f"The effects of {first} lie where {second} can start ...")
+    graph.set_axis_off()
+    graph.set(xlim=(0, 1), ylim=(0, 1))
+    graph.annotate("", (0.7, 0.5), (0.3, 0.5), arrowprops={"arrowstyle": "-|>", "linewidth": 2, "shrinkA": 22, "shrinkB": 22})
+    for x, name in ((0.25, first), (0.75, second)):
+        graph.text(x, 0.5, name, ha="center", va="center", bbox={"boxstyle": "circle,pad=0.6", "facecolor": "white"})
+    graph.text(0.5, 0.56, f"success rate {example.success_rate:.2f}", ha="center", fontsize=9)
+    graph.set_title("... which makes an edge")
+
+
+def plot_missed(
+    axes: Axes, visited: np.ndarray, events: np.ndarray, missed: np.ndarray, geometry: MazeGeometry | None, title: str
+) -> None:
+    """Draw what was visited, the events, and goals that were missed (Figure 9).
+
+    :param axes: where to draw
+    :param visited: shape ``(n, goal_dim)``
+    :param events: centres, shape ``(m, goal_dim)``
+    :param missed: goals not reached, shape ``(k, goal_dim)``
+    :param geometry: the maze
+    :param title: of the panel
+    """
+    figures.draw_floor(axes, geometry, visited, 1.0)
+    axes.plot(*figures.project(thinned(visited)).T, ".", color=figures.VISITED, markersize=2, zorder=figures.Z_VISITED)
+    axes.plot(
+        *figures.project(events).T, "o", color=figures.EVENT, markersize=6, label="salient event", zorder=figures.Z_EVENT
+    )
+    if len(missed):
+        axes.plot(*figures.project(missed).T, "x", color="#d7301f", label="goal missed", zorder=figures.Z_LABEL)
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=2, fontsize=8, frameon=False)
+    axes.set_title(title)
