@@ -90,8 +90,8 @@ def test_it_proposes_nothing_before_there_is_experience() -> None:
 
 
 def test_an_agent_finds_events_in_pairs() -> None:
-    agent = new_agent(salience="dco")
-    agent.learn(1_500)
+    agent = new_agent(salience="dco", retry_after=5)
+    agent.learn(1_000)
     assert agent.discovery.events_per_attempt == 2
     assert len(agent.events) >= 3
     centers = np.array([event.center for event in agent.events])

@@ -273,9 +273,6 @@ def test_figures_of_the_paper(number: int, runs: tuple[Path, Path], tmp_path: Pa
     image = imread(picture)
     assert image.shape[0] > 300
     assert image[..., :3].std() > 10
-    before = picture.read_bytes()
-    assert main(["figure", str(number), str(file), "--out", str(out), "--to", str(picture)]) == 0
-    assert picture.read_bytes() == before
 
 
 def test_curves_are_the_seeds_rows(runs: tuple[Path, Path]) -> None:

@@ -23,7 +23,6 @@ from sb3_skillgraph.salience.dco import FiedlerEmbedding, learn_fiedler
 from sb3_skillgraph.smdp import FlatPolicy, OptionsEnv, SMDPQLearning
 
 TERMINATION_SHARE = 0.05  # of the states seen, those with the lowest values are where an option ends
-REACH = 60  # steps that the pairs lie at most apart that an embedding is learned from
 
 
 class LowEnd:
@@ -71,7 +70,7 @@ class Everywhere(InitiationSet):
 
 
 class CoveringReplay(OptionReplay):
-    """All experience, paid for going down the embedding."""
+    """All experience, paid -1 a step, and for going down the embedding as far as a good step goes another 1."""
 
     end: LowEnd
     scale: float
@@ -94,7 +93,7 @@ class CoveringReplay(OptionReplay):
             actions=self._tensor(data["action"]),
             next_observations=self._tensor(self.view(data["next_observation"], there, goal)),
             dones=self._tensor(done.astype(np.float32)[:, None]),
-            rewards=self._tensor(((before - after) / self.scale).astype(np.float32)[:, None]),
+            rewards=self._tensor(((before - after) / self.scale - 1.0).astype(np.float32)[:, None]),
         )
 
 
@@ -111,6 +110,7 @@ class CoveringOptions:
     :param option_freq: episodes between options
     :param goal_freq: episodes per goal
     :param option_updates: gradient steps when an option is made; later one every ``train_freq`` steps for one of them
+    :param reach: steps that the pairs of states lie at most apart that an embedding is learned from
     :param train_freq: environment steps per gradient step
     :param batch_size: transitions in a minibatch
     :param gamma: discount factor per environment step
@@ -124,8 +124,9 @@ class CoveringOptions:
         *,
         n_options: int = 5,
         option_freq: int = 30,
-        goal_freq: int = 30,
+        goal_freq: int = 1,
         option_updates: int = 5_000,
+        reach: int = 60,
         train_freq: int = 2,
         batch_size: int = 128,
         gamma: float = 0.99,
@@ -136,6 +137,7 @@ class CoveringOptions:
         self.n_options = n_options
         self.option_freq = option_freq
         self.option_updates = option_updates
+        self.reach = reach
         self.train_freq = train_freq
         self.batch_size = batch_size
         self.exploration_noise = exploration_noise
@@ -231,7 +233,7 @@ class CoveringOptions:
             self._on_step(self.num_timesteps)
 
     def _make_option(self) -> Option:
-        embedding = learn_fiedler(self.store, REACH, 20_000, self.rng)
+        embedding = learn_fiedler(self.store, self.reach, 20_000, self.rng)
         rows = self.rng.integers(self.store.oldest, self.store.total, 20_000)
         end = LowEnd(embedding, 1.0 if len(self.options) % 2 == 0 else -1.0, self.store.column("achieved_goal", rows))
         option = self._factory.make(f"c{len(self.options)}", "low end", end)

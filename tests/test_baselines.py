@@ -1,0 +1,98 @@
+"""What the agent is compared with: goals as scheduled, covering options that lead to the ends."""
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from conftest import TOY
+from stable_baselines3 import DDPG, HerReplayBuffer
+
+from sb3_skillgraph import evaluate_pairs
+from sb3_skillgraph.baselines import CoveringOptions, GoalSchedule, make_her, make_uvfa
+from sb3_skillgraph.baselines.covering_options import TERMINATION_SHARE, LowEnd
+
+CORRIDOR = [[1] * 6, [1, "r", 0, 0, 0, 1], [1] * 6]
+
+
+def toy(**kwargs: object) -> gym.Env:
+    return gym.make(TOY, **{"terminate_on_success": True, **kwargs})
+
+
+def test_a_goal_is_kept_for_some_episodes() -> None:
+    env = GoalSchedule(toy(), 3)
+    goals = [tuple(env.reset(seed=0 if i == 0 else None)[0]["desired_goal"]) for i in range(7)]
+    assert goals[0] == goals[1] == goals[2] != goals[3] == goals[4] == goals[5] != goals[6]
+    once = env.reset(options={"goal": [1.0, 1.0]})[0]["desired_goal"]
+    np.testing.assert_array_equal(once, [1.0, 1.0])
+    assert tuple(env.reset()[0]["desired_goal"]) == goals[6]
+
+
+def test_the_goal_conditioned_baselines_are_sb3s_own() -> None:
+    uvfa, her = make_uvfa(toy(), seed=0, goal_freq=5), make_her(toy(), seed=0, batch_size=64)
+    assert type(uvfa) is type(her) is DDPG
+    assert isinstance(her.replay_buffer, HerReplayBuffer)
+    assert her.batch_size == 64
+    for model in (uvfa, her):
+        model.learn(1_200)
+        assert model._n_updates > 50
+
+
+def test_hindsight_reaches_goals() -> None:
+    model = make_her(toy(), seed=0, learning_starts=300, train_freq=(1, "step"))
+    model.learn(3_000)
+    assert evaluate_pairs(model, TOY, n_pairs=30).success_rate >= 0.4  # 0.7 in most seeds, a random walk 0.1
+
+
+class AnyStart(gym.Wrapper):
+    """Begins episodes anywhere, so that chance alone explores the corridor."""
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        self.env.reset(seed=seed)
+        start = self.get_wrapper_attr("sample_free")(self.get_wrapper_attr("np_random"))
+        return self.env.reset(options={"start": start, **(options or {})})
+
+
+@pytest.fixture(scope="module")
+def covering() -> CoveringOptions:
+    env = AnyStart(toy(maze_map=CORRIDOR))
+    return CoveringOptions(env, n_options=2, option_updates=2_000, reach=10, seed=0).learn(4_000)
+
+
+def test_covering_options_end_where_the_embedding_is_lowest(covering: CoveringOptions) -> None:
+    assert [option.id for option in covering.options] == ["c0", "c1"]
+    for option in covering.options:
+        end = option.termination
+        assert isinstance(end, LowEnd)
+        rows = np.arange(covering.store.total)
+        points = covering.store.column("achieved_goal", rows)
+        assert end.holds(end.center)
+        assert 0.0 < end.contains(points).mean() < 6 * TERMINATION_SHARE
+        assert option.initiation.optimistic(points).all()
+
+
+def test_a_covering_option_gets_there(covering: CoveringOptions) -> None:
+    options, maze = covering.env, toy(maze_map=CORRIDOR)
+    hits, ends = [], []
+    for action, option in enumerate(covering.options):
+        ends.append(float(option.subgoal[0]))
+        for x in (-1.5, -0.5, 0.5, 1.5):
+            observation, _ = maze.reset(options={"start": [x, 0.0], "goal": [0.0, 0.4]})
+            run = options.begin(observation, action)
+            for _ in range(40):
+                observation = maze.step(options.act(run, observation))[0]
+                if run.reached(observation["achieved_goal"]):
+                    break
+            hits.append(run.reached(observation["achieved_goal"]))
+    assert min(ends) < -1.3
+    assert max(ends) > 1.3
+    assert np.mean(hits) >= 0.6
+
+
+def test_steps_are_the_environments_and_decisions_fewer(covering: CoveringOptions) -> None:
+    assert 4_000 <= covering.num_timesteps < 4_000 + covering.env.timeout
+    assert covering.store.total == covering.num_timesteps
+    assert covering.model.num_timesteps < covering.num_timesteps
+    assert covering.model.exploration_rate == pytest.approx(0.1)
+    result = evaluate_pairs(covering, TOY, env_kwargs={"maze_map": CORRIDOR}, n_pairs=5)
+    assert len(result.pairs) == 5
