@@ -17,7 +17,7 @@ from imageio.v3 import imread
 
 from sb3_skillgraph.cli import main
 from sb3_skillgraph.experiments import RunSpec, compare, load_plan, run, runner, status
-from sb3_skillgraph.experiments.figures import method_curves
+from sb3_skillgraph.experiments.figures import method_curves, practice_curves
 from sb3_skillgraph.experiments.runner import checkpoints, read_progress
 from sb3_skillgraph.experiments.summary import estimate, interquartile_mean
 
@@ -34,7 +34,7 @@ SMALL_NETS = {
 
 def spec(algorithm: str = "skill_graph", steps: int = 600, **changes: Any) -> RunSpec:
     arguments = SMALL_NETS if algorithm == "skill_graph" else {}
-    values: dict[str, Any] = dict(check_every=200, pairs=3, final_pairs=4, arguments=arguments, seed=0)
+    values: dict[str, Any] = dict(check_every=200, pairs=3, final_pairs=4, arguments=arguments, seed=0, test_pairs=0)
     return RunSpec(algorithm, "toy", algorithm=algorithm, env_id=TOY, steps=steps, **{**values, **changes})
 
 
@@ -62,7 +62,8 @@ def plan(path: Path, **changes: Any) -> Path:
 @pytest.mark.parametrize("algorithm", ["skill_graph", "uvfa", "her", "covering_options", "random_walk"])
 def test_a_run_leaves_everything_and_is_not_done_again(algorithm: str, tmp_path: Path) -> None:
     arguments = {"covering_options": {"n_options": 2, "option_updates": 20}}
-    this = spec(algorithm, steps=400, **({"arguments": arguments[algorithm]} if algorithm in arguments else {}))
+    changes = {"arguments": arguments[algorithm]} if algorithm in arguments else {}
+    this = spec(algorithm, steps=400, test_pairs=2, test_stretches=1, **changes)
     assert run(this, tmp_path) == "done", (this.folder(tmp_path) / "error.txt").read_text()
     folder = this.folder(tmp_path)
     assert folder == tmp_path / "toy" / algorithm / "seed0"
@@ -75,6 +76,9 @@ def test_a_run_leaves_everything_and_is_not_done_again(algorithm: str, tmp_path:
     done = json.loads((folder / "done.json").read_text())
     assert len(done["pairs"]) == 4
     assert done["success_rate"] == pytest.approx(sum(pair["success"] for pair in done["pairs"]) / 4)
+    assert [len(tests) for tests in done["test_time"]] == [2, 2]
+    if algorithm != "random_walk":  # chance walks differently the next time
+        assert [tests[0] for tests in done["test_time"]] == [pair["success"] for pair in done["pairs"][:2]]
     assert not list(folder.glob("*.partial"))
     before = {path: path.stat().st_mtime_ns for path in folder.rglob("*") if path.name != "lock"}
     assert run(this, tmp_path) == "skipped"
@@ -154,8 +158,9 @@ def test_on_loky(tmp_path: Path) -> None:
     assert {s.state for s in status(specs, tmp_path / "runs")} == {"done"}
 
 
-def test_on_ray(tmp_path: Path) -> None:
+def test_on_ray(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ray = pytest.importorskip("ray")
+    monkeypatch.setenv("RAY_worker_niceness", "0")  # lest its workers starve beside the other tests
     ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False)
     try:
         specs = load_plan(plan(tmp_path / "plan.yml", methods={"walk": {"algorithm": "random_walk"}}))
@@ -260,7 +265,9 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
         "walk": {"algorithm": "random_walk"},
     }
     toy = {"toy": {"id": TOY, "steps": 1600}}
-    file = plan(folder / "plan.yml", methods=methods, environments=toy, seeds=[1], check_every=400)
+    file = plan(
+        folder / "plan.yml", methods=methods, environments=toy, seeds=[1], check_every=400, test_pairs=1, test_stretches=1
+    )
     assert compare(load_plan(file), folder / "runs", n_jobs=2) == ["done"] * 3
     return file, folder / "runs"
 
@@ -283,6 +290,9 @@ def test_curves_are_the_seeds_rows(runs: tuple[Path, Path]) -> None:
     assert curves["frontier"].steps.tolist() == [400, 800, 1200, 1600]
     assert curves["frontier"].mean.tolist() == pytest.approx([float(row["eval/success_rate"]) for row in rows])
     assert curves["walk"].steps.tolist() == [0, 1600]
+    tested = practice_curves(specs, runs[1])
+    assert list(tested) == ["frontier", "dco", "walk"]
+    assert all(curve.steps.tolist() == [0, 1000] for curve in tested.values())
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """Deep covering options: skills to the ends of the explored space, composed by SMDP Q-learning (sections 2.3, 4, A.5)."""
 
+import copy
 from collections.abc import Callable
 from typing import Any
 
@@ -10,10 +11,11 @@ from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
+from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_skillgraph.baselines.goal_conditioned import GoalSchedule
 from sb3_skillgraph.goal_env import GoalSpec
-from sb3_skillgraph.options.factory import OptionFactory
+from sb3_skillgraph.options.factory import OptionFactory, copy_policy
 from sb3_skillgraph.options.initiation import InitiationSet
 from sb3_skillgraph.options.learner import OptionDDPG
 from sb3_skillgraph.options.option import Option
@@ -134,6 +136,7 @@ class CoveringOptions:
         seed: int = 0,
     ) -> None:
         assert isinstance(env.action_space, spaces.Box)
+        self._arguments = {k: v for k, v in locals().items() if k not in ("self", "env")}
         self.n_options = n_options
         self.option_freq = option_freq
         self.option_updates = option_updates
@@ -192,8 +195,27 @@ class CoveringOptions:
         episodes = total_timesteps // int(self.env.get_wrapper_attr("max_steps"))
         self._next_option = self.option_freq = max(1, min(self.option_freq, episodes // (self.n_options + 1)))
         self.model.budget.start, self.model.budget.total = self.num_timesteps, total_timesteps
-        self.model.learn(total_timesteps, callback=self.model.budget, log_interval=1_000_000)
+        self.model.learn(total_timesteps, self.model.budget, log_interval=1_000_000, reset_num_timesteps=False)
         return self
+
+    def copy(self, env: gym.Env) -> "CoveringOptions":
+        """Return a copy that knows the same and explores no more than at the end of learning.
+
+        :param env: the environment that it goes on in
+        """
+        twin = CoveringOptions(env, **self._arguments)
+        twin.store.set_state(self.store.get_state())
+        twin.store.cut()
+        for option in self.options:
+            assert isinstance(option.replay, CoveringReplay)
+            twin.options.append(twin._option(option.id, option.replay.end, option.replay.scale))
+            copy_policy(option, twin.options[-1])
+        twin.model.set_parameters(self.model.get_parameters())  # type: ignore[arg-type]
+        twin.model.replay_buffer = copy.deepcopy(self.model.replay_buffer)
+        twin.model.num_timesteps = self.model.num_timesteps
+        least = twin.model.exploration_final_eps
+        twin.model.exploration_schedule = LinearSchedule(least, least, 1.0)
+        return twin
 
     def predict(
         self,
@@ -236,19 +258,22 @@ class CoveringOptions:
         embedding = learn_fiedler(self.store, self.reach, 20_000, self.rng)
         rows = self.rng.integers(self.store.oldest, self.store.total, 20_000)
         end = LowEnd(embedding, 1.0 if len(self.options) % 2 == 0 else -1.0, self.store.column("achieved_goal", rows))
-        option = self._factory.make(f"c{len(self.options)}", "low end", end)
-        replay = option.replay
-        option.learner.replay_buffer = covering = CoveringReplay(
-            self.store, replay.view, replay.rule, self._factory.observation_space, self._factory.action_space, self.rng
-        )
-        steps = end.values(self.store.column("next_achieved_goal", rows)) - end.values(
-            self.store.column("achieved_goal", rows)
-        )
-        covering.end, covering.scale = end, float(np.quantile(np.abs(steps), 0.95)) or 1.0
-        option.initiation = Everywhere(option.radius)
-        option.mature = True
+        before, after = (end.values(self.store.column(name, rows)) for name in ("achieved_goal", "next_achieved_goal"))
+        scale = float(np.quantile(np.abs(before - after), 0.95)) or 1.0
+        option = self._option(f"c{len(self.options)}", end, scale)
         for _ in range(self.option_updates):
             option.learner.train(1, self.batch_size)
+        return option
+
+    def _option(self, id: str, end: LowEnd, scale: float) -> Option:
+        option = self._factory.make(id, "low end", end)
+        plain, factory = option.replay, self._factory
+        option.learner.replay_buffer = covering = CoveringReplay(
+            self.store, plain.view, plain.rule, factory.observation_space, factory.action_space, self.rng
+        )
+        covering.end, covering.scale = end, scale
+        option.initiation = Everywhere(option.radius)
+        option.mature = True
         return option
 
 

@@ -12,7 +12,7 @@ from sb3_skillgraph.agent import SkillGraphAgent
 from sb3_skillgraph.baselines import RandomWalk
 from sb3_skillgraph.envs import MazeGeometry
 from sb3_skillgraph.experiments.plan import RunSpec
-from sb3_skillgraph.experiments.runner import DONE, STEPS, checkpoints, read_progress
+from sb3_skillgraph.experiments.runner import DONE, STEPS, STRETCH, checkpoints, read_progress
 from sb3_skillgraph.experiments.summary import estimate
 from sb3_skillgraph.plotting import paper_figures as draw
 from sb3_skillgraph.salience.dco import learn_fiedler
@@ -136,18 +136,23 @@ def _random_walk(spec: RunSpec, n_steps: int) -> np.ndarray:
 
 
 def curves(specs: Sequence[RunSpec], out: Path) -> Axes:
-    """Figure 5: success on unseen pairs of start and goal against training steps, a panel for each environment."""
+    """Figure 5: success on unseen pairs, a panel for each environment.
+
+    Above against training steps; below, if there was a test time, against the steps that a copy learned with each pair.
+    """
     labels = list(dict.fromkeys(spec.environment for spec in specs))
-    panels = draw.new_panels(len(labels))
-    found = False
-    for axes, label in zip(panels, labels, strict=True):
-        here = [spec for spec in specs if spec.environment == label]
-        found |= bool(by_method := method_curves(here, out))
-        n_seeds = len({spec.seed for spec in here})
-        draw.plot_curves(axes, by_method, f"{label} ({n_seeds} seeds)")
-    if not found:
+    by_label = [[spec for spec in specs if spec.environment == label] for label in labels]
+    training = [method_curves(here, out) for here in by_label]
+    if not any(training):
         raise MissingRunError(f"There are no results in {out} yet.")
-    panels[-1].legend(fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
+    testing = [practice_curves(here, out) for here in by_label]
+    panels = draw.new_panels(len(labels) * (1 + any(testing)), n_rows=1 + any(testing))
+    for axes, by_method, here, label in zip(panels, training, by_label, labels, strict=False):
+        draw.plot_curves(axes, by_method, f"{label} ({len({spec.seed for spec in here})} seeds)")
+    if any(testing):
+        for axes, by_method, label in zip(panels[len(labels) :], testing, labels, strict=True):
+            draw.plot_curves(axes, by_method, f"{label}, at test time", "environment steps with the goal")
+    panels[len(labels) - 1].legend(fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
     return panels[0]
 
 
@@ -169,6 +174,24 @@ def method_curves(specs: Sequence[RunSpec], out: Path) -> dict[str, draw.Curve]:
             steps, scores = [0, *steps], np.repeat(scores, 2, axis=1)
         estimates = np.array([estimate(column[None]) for column in scores.T])
         result[method] = draw.Curve(np.array(steps), *estimates.T)
+    return result
+
+
+def practice_curves(specs: Sequence[RunSpec], out: Path) -> dict[str, draw.Curve]:
+    """Read how success grows with the steps that copies learn with each pair.
+
+    :param specs: runs on one environment
+    :param out: folder of all runs
+    """
+    result = {}
+    for method in dict.fromkeys(spec.method for spec in specs):
+        files = [spec.folder(out) / DONE for spec in specs if spec.method == method]
+        tests = [json.loads(file.read_text())["test_time"] for file in files if file.exists()]
+        if not tests or not tests[0]:
+            continue
+        scores = np.array([np.mean(pairs, axis=0) for pairs in tests])
+        estimates = np.array([estimate(column[None]) for column in scores.T])
+        result[method] = draw.Curve(STRETCH * np.arange(scores.shape[1]), *estimates.T)
     return result
 
 

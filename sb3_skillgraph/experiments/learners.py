@@ -1,12 +1,16 @@
 """The methods that are compared, each behind the same few calls."""
 
+import io
+import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 from gymnasium import spaces
+from stable_baselines3 import DDPG
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_skillgraph.agent import SkillGraphAgent
@@ -56,6 +60,17 @@ class Learner(ABC):
         :param folder: what :meth:`save` has filled
         """
 
+    @abstractmethod
+    def practise(self, env: gym.Env, start: np.ndarray, goal: np.ndarray, stretches: list[int]) -> Iterator[Predictor]:
+        """Go on learning, as a copy, with one start and one goal, as at the paper's test time (section 4.2).
+
+        :param env: begins every episode at the start, with the goal, and ends it there
+        :param start: shape ``(goal_dim,)``
+        :param goal: shape ``(goal_dim,)``
+        :param stretches: environment steps from one test to the next
+        :return: what is to be tested: at once, and after every stretch
+        """
+
     def summary(self) -> dict[str, float]:
         """Return what else is worth a column."""
         return {}
@@ -93,6 +108,14 @@ class SkillGraphLearner(Learner):
         self.policy = SkillGraphAgent.load(folder / "agent.zip", env=self.env)
         self.policy.load_replay_buffer(folder / "experience")
 
+    def practise(self, env: gym.Env, start: np.ndarray, goal: np.ndarray, stretches: list[int]) -> Iterator[Predictor]:
+        """Adapt a copy; its episodes do not end at the goal."""
+        twin = self.policy.copy(gym.make(self.env.spec))  # type: ignore[arg-type]
+        yield twin
+        for n_steps in stretches:
+            twin.adapt(goal, start=start, total_timesteps=n_steps)
+            yield twin
+
     def summary(self) -> dict[str, float]:
         """Describe the graph."""
         return {f"skillgraph/{name}": value for name, value in self.policy.graph_summary().items()}
@@ -128,12 +151,28 @@ class GoalConditionedLearner(Learner):
 
     def __init__(self, env_id: str, env_kwargs: dict[str, Any], seed: int, arguments: dict[str, Any]) -> None:
         env = gym.make(env_id, **{"terminate_on_success": True, **env_kwargs})
-        self.policy = type(self).make(env, seed=seed, **arguments)
+        self.policy: DDPG = type(self).make(env, seed=seed, **arguments)
 
     def learn(self, begin: int, end: int, every: int, check: Check) -> None:
         """Learn in one go."""
-        self.policy.learn(end, callback=_Checks(every, end, check), log_interval=1_000_000)  # type: ignore[attr-defined]
+        self.policy.learn(end, callback=_Checks(every, end, check), log_interval=1_000_000)
         check(end)
+
+    def practise(self, env: gym.Env, start: np.ndarray, goal: np.ndarray, stretches: list[int]) -> Iterator[Predictor]:
+        """Let a copy go on learning."""
+        model, experience = io.BytesIO(), io.BytesIO()
+        self.policy.save(model)
+        self.policy.save_replay_buffer(experience)
+        model.seek(0)
+        experience.seek(0)
+        twin = DDPG.load(model, env=env)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # that the running episode is cut is meant
+            twin.load_replay_buffer(experience)
+        yield twin
+        for n_steps in stretches:
+            twin.learn(n_steps, log_interval=1_000_000, reset_num_timesteps=False)
+            yield twin
 
 
 class UVFALearner(GoalConditionedLearner):
@@ -165,6 +204,14 @@ class CoveringOptionsLearner(Learner):
         self.policy.learn(end, on_step)
         check(end)
 
+    def practise(self, env: gym.Env, start: np.ndarray, goal: np.ndarray, stretches: list[int]) -> Iterator[Predictor]:
+        """Let a copy go on learning."""
+        twin = self.policy.copy(env)
+        yield twin
+        for n_steps in stretches:
+            twin.learn(n_steps)
+            yield twin
+
 
 class RandomWalkLearner(Learner):
     """Learns nothing; the least to beat."""
@@ -178,6 +225,12 @@ class RandomWalkLearner(Learner):
     def learn(self, begin: int, end: int, every: int, check: Check) -> None:
         """Only be tested."""
         check(end)
+
+    def practise(self, env: gym.Env, start: np.ndarray, goal: np.ndarray, stretches: list[int]) -> Iterator[Predictor]:
+        """Only be tested."""
+        yield self.policy
+        for _ in stretches:
+            yield self.policy
 
 
 ALGORITHMS: dict[str, type[Learner]] = {

@@ -10,7 +10,8 @@ import yaml
 from sb3_skillgraph.experiments.learners import ALGORITHMS
 from sb3_skillgraph.hyperparams import check_hyperparams, did_you_mean
 
-_TOP = {"methods": dict, "environments": dict, "seeds": list, "check_every": int, "pairs": int, "final_pairs": int}
+_COMMON = ("check_every", "pairs", "final_pairs", "test_pairs", "test_stretches")
+_TOP = {"methods": dict, "environments": dict, "seeds": list, **dict.fromkeys(_COMMON, int)}
 _METHOD = {"algorithm": str, "arguments": dict}
 _ENVIRONMENT = {"id": str, "kwargs": dict, "steps": int, "seeds": list, "methods": list}
 
@@ -28,6 +29,8 @@ class RunSpec:
     :param check_every: steps between tests, after each of which a checkpoint is taken
     :param pairs: pairs of start and goal in these tests
     :param final_pairs: pairs in the last one
+    :param test_pairs: pairs with each of which, after that, a copy goes on learning
+    :param test_stretches: for how many times 1000 steps, with a test after each
     :param arguments: of the algorithm
     :param env_kwargs: of the environment
     """
@@ -41,6 +44,8 @@ class RunSpec:
     check_every: int = 10_000
     pairs: int = 20
     final_pairs: int = 100
+    test_pairs: int = 0
+    test_stretches: int = 5
     arguments: dict[str, Any] = field(default_factory=dict)
     env_kwargs: dict[str, Any] = field(default_factory=dict)
 
@@ -58,7 +63,7 @@ def load_plan(path: Path) -> list[RunSpec]:
 
     :param path: YAML file: ``methods`` (name -> ``algorithm``, ``arguments``), ``environments`` (name -> ``id``,
         ``kwargs``, ``steps``, and ``seeds`` or ``methods`` where not all are wanted), ``seeds``, ``check_every``,
-        ``pairs``, ``final_pairs``
+        ``pairs``, ``final_pairs``, ``test_pairs``, ``test_stretches``
     :return: one spec for each run, seed by seed, so that the first results compare all methods
     :raises ValueError: if the file says anything else, or too little
     """
@@ -81,7 +86,7 @@ def load_plan(path: Path) -> list[RunSpec]:
         str(name): _checked(value, _ENVIRONMENT, f"{path}, environment {name!r}", required=("id", "steps"))
         for name, value in top["environments"].items()
     }
-    common = {name: top[name] for name in ("check_every", "pairs", "final_pairs") if name in top}
+    common = {name: top[name] for name in _COMMON if name in top}
     specs = []
     for label, env in environments.items():
         unknown = [name for name in env.get("methods", ()) if name not in methods]

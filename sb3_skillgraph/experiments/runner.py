@@ -12,16 +12,19 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
+import gymnasium as gym
+import numpy as np
 import torch as th
 from filelock import FileLock, Timeout
 from joblib import Parallel, delayed, parallel_config
 
-from sb3_skillgraph.evaluation import PairsResult, evaluate_pairs
+from sb3_skillgraph.evaluation import PairsResult, evaluate_pairs, run_pair
 from sb3_skillgraph.experiments.learners import ALGORITHMS, Learner
 from sb3_skillgraph.experiments.plan import RunSpec
 
 CONFIG, PROGRESS, DONE, ERROR, LOCK = "config.json", "progress.csv", "done.json", "error.txt", "lock"
 STEPS, SECONDS = "time/total_timesteps", "time/seconds"
+STRETCH = 1_000  # environment steps between tests at test time: an episode
 Outcome = Literal["done", "skipped", "elsewhere", "failed"]
 _VERSIONS_OF = ("sb3_skillgraph", "stable_baselines3", "torch", "gymnasium", "gymnasium_robotics", "mujoco", "numpy")
 
@@ -124,6 +127,7 @@ class _Run:
                 }
                 for p in result.pairs
             ],
+            "test_time": self._test_time(result),
             **self.learner.summary(),
         }
         write_atomically(folder / DONE, json.dumps(document, indent=1) + "\n")
@@ -175,6 +179,21 @@ class _Run:
             self.learner.policy, spec.env_id, env_kwargs=spec.env_kwargs, n_pairs=n_pairs, seed=spec.seed + 1000
         )
 
+    def _test_time(self, result: PairsResult) -> list[list[bool]]:
+        """Let copies go on learning with one pair each; return, pair by pair, what every test gave."""
+        spec = self.spec
+        env_kwargs = {"terminate_on_success": True, **spec.env_kwargs}
+        curves = []
+        for pair in result.pairs[: spec.test_pairs]:
+            pinned, test = (gym.make(spec.env_id, **env_kwargs) for _ in range(2))
+            test.reset(seed=spec.seed)
+            practice = Pinned(pinned, pair.start, pair.goal)
+            twins = self.learner.practise(practice, pair.start, pair.goal, [STRETCH] * spec.test_stretches)
+            curves.append([run_pair(twin, test, pair.start, pair.goal, pair.path_length).success for twin in twins])
+            pinned.close()
+            test.close()
+        return curves
+
     def _save(self, n_steps: int) -> None:
         before = checkpoints(self.folder)
         partial = self.folder / "checkpoint.partial"
@@ -184,6 +203,27 @@ class _Run:
         partial.rename(self.folder / f"checkpoint_{n_steps}")
         for path in before.values():
             shutil.rmtree(path)
+
+
+class Pinned(gym.Wrapper):
+    """Begins every episode at one start, with one goal.
+
+    :param env: an environment whose ``reset`` takes both
+    :param start: shape ``(goal_dim,)``
+    :param goal: shape ``(goal_dim,)``
+    """
+
+    def __init__(self, env: gym.Env, start: np.ndarray, goal: np.ndarray) -> None:
+        super().__init__(env)
+        self.options = {"start": start, "goal": goal}
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode.
+
+        :param seed: seeds the wrapped environment
+        :param options: not used
+        """
+        return self.env.reset(seed=seed, options=self.options)
 
 
 def checkpoints(folder: Path) -> dict[int, Path]:
