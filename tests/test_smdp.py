@@ -196,7 +196,7 @@ def test_monitor_counts_decisions_and_seeds_repeat(agent: SkillGraphAgent) -> No
 def test_the_graph_plans_on_it(agent: SkillGraphAgent) -> None:
     env = lifted(agent, route=agent.planner.route)
     policy = GraphPolicy(agent.planner, env)
-    rewards, lengths = evaluate_policy(policy, Monitor(env), n_eval_episodes=20, return_episode_rewards=True)  # type: ignore[arg-type]
+    rewards, lengths = evaluate_policy(policy, Monitor(env), n_eval_episodes=20, return_episode_rewards=True)
     assert len(rewards) == len(lengths) == 20
     successes = np.array(rewards) > 0
     agent.planning = False

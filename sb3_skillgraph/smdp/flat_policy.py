@@ -13,7 +13,7 @@ class HighLevel(Protocol):
 
     def predict(
         self,
-        observation: dict[str, np.ndarray],
+        observation: np.ndarray | dict[str, np.ndarray],
         state: tuple[np.ndarray, ...] | None = None,
         episode_start: np.ndarray | None = None,
         deterministic: bool = False,
@@ -42,7 +42,7 @@ class FlatPolicy:
 
     def predict(
         self,
-        observation: dict[str, np.ndarray],
+        observation: np.ndarray | dict[str, np.ndarray],
         state: tuple[np.ndarray, ...] | None = None,
         episode_start: np.ndarray | None = None,
         deterministic: bool = False,
@@ -56,6 +56,7 @@ class FlatPolicy:
         :param deterministic: passed to the high level
         :return: the action, and the state
         """
+        assert isinstance(observation, dict)
         run: Run | None = None
         steps, memory = 0, None
         if state is not None and not (episode_start is not None and np.any(episode_start)):

@@ -43,7 +43,7 @@ class GraphPolicy:
 
     def predict(
         self,
-        observation: dict[str, np.ndarray],
+        observation: np.ndarray | dict[str, np.ndarray],
         state: tuple[np.ndarray, ...] | None = None,
         episode_start: np.ndarray | None = None,
         deterministic: bool = False,
@@ -57,6 +57,7 @@ class GraphPolicy:
         :param deterministic: not used: plans are
         :return: the actions, and the state
         """
+        assert isinstance(observation, dict)
         points = np.atleast_2d(observation["achieved_goal"])
         goals, masks = np.atleast_2d(observation["desired_goal"]), np.atleast_2d(observation[MASK])
         n_envs = len(points)
