@@ -203,10 +203,10 @@ def in_new_process(code: str, *arguments: object, hash_seed: int = 1) -> None:
 
 
 def rich(agent: SkillGraphAgent) -> bool:
-    """Whether an agent has mature options, edges, and a place from which its graph leads there and back."""
+    """Whether an agent has mature options, edges, a place to which its graph leads there and back, and many more."""
     complete = {(chain.source, chain.target) for chain in agent.chaining.chains.values() if chain.complete}
     there_and_back = any((target, source) in complete for source, target in complete)
-    return len(agent.graph.options) > 4 and agent.graph.nx.number_of_edges() > 4 and there_and_back
+    return len(agent.graph.options) > 4 and agent.graph.joined_pairs() > 0.5 and there_and_back
 
 
 # -- fixtures ---------------------------------------------------------------------------------------------------------

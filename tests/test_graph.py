@@ -112,11 +112,11 @@ def test_by_default_rates_begin_high_and_failures_are_dear() -> None:
     graph.add_event(E0)
     graph.add_event(E1)
     graph.add_option(make_option("o1", "e1", E1, start=((0.0, 0.0), 2.0)))
-    assert graph.nx.edges["o1", "e1"]["success_rate"] == pytest.approx(0.8)
-    assert graph.nx.edges["o1", "e1"]["weight"] == pytest.approx(1 + 5 / 4)  # a quarter of a failure before a success
-    for _ in range(3):
+    assert graph.nx.edges["o1", "e1"]["success_rate"] == pytest.approx(0.95)
+    assert graph.nx.edges["o1", "e1"]["weight"] == pytest.approx(1 + 5 / 19)  # a nineteenth of a failure before a success
+    for _ in range(4):
         ran(graph, graph.options["o1"], False)
-    assert graph.nx.edges["o1", "e1"]["success_rate"] == pytest.approx(1.6 / 5)
+    assert graph.nx.edges["o1", "e1"]["success_rate"] == pytest.approx(1.9 / 6)
     ran(graph, graph.options["o1"], False)
     assert not graph.nx.has_edge("o1", "e1")
 

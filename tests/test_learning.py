@@ -33,7 +33,9 @@ class RandomWalk:
 
 
 def test_reaches_goals_it_never_trained_on() -> None:
-    agent = SkillGraphAgent("MultiInputPolicy", gym.make(TOY), **{**SMALL, "policy_kwargs": dict(net_arch=[32, 32])})
+    agent = SkillGraphAgent(
+        "MultiInputPolicy", gym.make(TOY), **{**SMALL, "policy_kwargs": dict(net_arch=[32, 32]), "seed": 1}
+    )
     untrained = evaluate_pairs(agent, TOY).success_rate
     random = evaluate_pairs(RandomWalk(), TOY).success_rate
     agent.learn(5000, log_interval=None)
@@ -50,7 +52,7 @@ def test_finds_a_way_to_a_region_that_training_never_reached() -> None:
     shut: MazeMap = [[1] * 7, [1, "r", 0, 1, 0, 0, 1], [1, 0, 0, 1, 0, 0, 1], [1] * 7]
     opened: MazeMap = [[1] * 7, [1, "r", 0, 1, 0, 0, 1], [1, 0, 0, 0, 0, 0, 1], [1] * 7]
     agent = SkillGraphAgent(
-        "MultiInputPolicy", gym.make(TOY, maze_map=shut), **{**SMALL, "policy_kwargs": dict(net_arch=[32, 32])}
+        "MultiInputPolicy", gym.make(TOY, maze_map=shut), **{**SMALL, "policy_kwargs": dict(net_arch=[32, 32]), "seed": 1}
     )
     agent.learn(3000, log_interval=None)
     assert agent.visited.points[:, 0].max() < 0.0
