@@ -16,7 +16,6 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_skillgraph import GraphPolicy, OptionsEnv, SkillGraphAgent, SMDPQLearning
 from sb3_skillgraph.events import SalientEvent
-from sb3_skillgraph.options.option import Option
 from sb3_skillgraph.smdp import FlatPolicy
 
 GAMMA = 0.9
@@ -169,9 +168,25 @@ def test_what_it_refuses(agent: SkillGraphAgent) -> None:
         OptionsEnv(gym.make("CartPole-v1"), agent.options)
     with pytest.raises(ValueError, match=r"global_option=agent\.global_option"):
         OptionsEnv(gym.make(TOY), [], primitives=np.zeros((0, 2)))
-    many: list[Option] = [agent.global_option] * 11
+    event = SalientEvent("e0", np.zeros(2), 0.45)
+    many = [make_option(f"o{i}", "e0", event) for i in range(11)]
     with pytest.raises(ValueError, match=r"11 options and 6 actions .* max_options=16: give max_options=32"):
         OptionsEnv(gym.make(TOY), many, global_option=agent.global_option, max_options=16)
+    with pytest.raises(ValueError, match="There is no global option"):
+        GraphPolicy(agent.planner, OptionsEnv(gym.make(TOY), many))
+
+
+def test_the_global_option_may_be_among_the_options_or_missing(agent: SkillGraphAgent) -> None:
+    goal = {"start": [-1.0, 1.0], "goal": [-1.0, 0.7]}
+    listed = OptionsEnv(gym.make(TOY), [agent.global_option, *agent.options], view=agent.view)
+    listed.reset(options=goal)
+    assert (listed.global_action, listed.first_fixed) == (0, 59)
+    assert listed.action_masks()[0]
+    assert listed.step(0)[-1]["option"] == "global"
+    without = OptionsEnv(gym.make(TOY), list(agent.options))
+    without.reset(options=goal)
+    assert without.action_masks()[-5:].all()
+    assert without.first_fixed == 59
 
 
 def test_monitor_counts_decisions_and_seeds_repeat(agent: SkillGraphAgent) -> None:

@@ -36,10 +36,9 @@ class GraphPolicy:
     """
 
     def __init__(self, planner: GraphPlanner, env: OptionsEnv) -> None:
-        if env.global_option is None:
-            raise ValueError("Outside the graph the global option walks: OptionsEnv(..., global_option=agent.global_option).")
         self.planner = planner
         self.env = env
+        self.global_action = env.global_action
 
     def predict(
         self,
@@ -73,7 +72,7 @@ class GraphPolicy:
     def _learn_of_failure(self, last: GraphPolicyState, i: int, point: np.ndarray) -> None:
         """Note whether the option that has just ended did not get where it leads."""
         action = int(last.action[i])
-        if action >= self.env.first_fixed:
+        if action == self.global_action:
             last.failures[i] += 1
         elif action >= 0:
             last.failed[i] = -1 if self.env.options[action].terminates(point) else action
@@ -84,4 +83,4 @@ class GraphPolicy:
         path = legs[last.failures[i] // PATIENCE % len(legs)].path if legs else None
         if path is not None and mask[action := self.env.index(path.vertices[0])]:
             return action
-        return self.env.first_fixed  # the global option
+        return self.global_action

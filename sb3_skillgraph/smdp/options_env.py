@@ -49,8 +49,8 @@ class OptionsEnv(gym.Wrapper):
     list at any time; actions of those still unborn are masked.
 
     :param env: a goal environment (Dict observations, Box actions)
-    :param options: options, such as ``agent.options``, which knows the agent's global option
-    :param global_option: walks straight to any goal; by default the one that ``options`` knows
+    :param options: options, such as ``agent.options``, which knows the agent's global option; that one may be among them
+    :param global_option: walks straight to any goal; by default the one among ``options``, or that they know
     :param primitives: actions scaled to [-1, 1], shape ``(n, action_dim)``; None takes both directions of every axis and
         standing still where actions have at most two dimensions, else one step of the global option's policy
     :param max_options: number of actions: room for options and primitive actions
@@ -85,7 +85,9 @@ class OptionsEnv(gym.Wrapper):
         self.gamma = gamma
         self.timeout = timeout
         self.route = route
-        self.global_option: Option | None = global_option or getattr(options, "global_option", None)
+        listed = next((option for option in options if option.target is None), None)
+        self.global_option: Option | None = global_option or listed or getattr(options, "global_option", None)
+        self._is_listed = listed is not None
         self.primitives = self._find_primitives(env.action_space, primitives)
         name = env.get_wrapper_attr("option_view") if env.has_wrapper_attr("option_view") else "relative"
         radius = 1.0 if self.global_option is None else self.global_option.radius
@@ -124,7 +126,17 @@ class OptionsEnv(gym.Wrapper):
     @property
     def first_fixed(self) -> int:
         """The first of the actions that can always be taken: the global option if there is one, then primitives."""
-        return self.max_options - len(self.primitives) - (self.global_option is not None)
+        return self.max_options - len(self.primitives) - (self.global_option is not None and not self._is_listed)
+
+    @property
+    def global_action(self) -> int:
+        """Index of the global option.
+
+        :raises ValueError: if there is none
+        """
+        if self.global_option is None:
+            raise ValueError("There is no global option: OptionsEnv(..., global_option=agent.global_option).")
+        return self.index(self.global_option.id) if self._is_listed else self.first_fixed
 
     def index(self, option: str) -> int:
         """Return an option's action.
@@ -169,7 +181,8 @@ class OptionsEnv(gym.Wrapper):
         point = np.asarray(observation["achieved_goal"])
         mask = np.zeros(self.max_options, dtype=bool)
         mask[: len(self.options)] = [
-            option.mature and bool(option.initiation.optimistic(point[None])[0]) and not option.terminates(point)
+            option.target is None
+            or (option.mature and bool(option.initiation.optimistic(point[None])[0]) and not option.terminates(point))
             for option in self.options
         ]
         mask[self.first_fixed :] = True
@@ -206,27 +219,20 @@ class OptionsEnv(gym.Wrapper):
         :param action: its index
         """
         point, goal = np.asarray(observation["achieved_goal"]), np.asarray(observation["desired_goal"])
-        if action < self.first_fixed:
-            option = self.options[action]
+        option = self.options[action] if action < self.first_fixed else self.global_option
+        if option is not None and option.target is not None:
             return Run(option.id, option, None, option.subgoal, option.terminates, self.timeout)
         index = action - self.max_options + len(self.primitives)
         if index >= 0:
             primitive = self.primitives[index]
             acts = self.global_option if primitive is None else None
             return Run(f"primitive {index}", acts, primitive, goal, lambda point: True, 1)
-        assert self.global_option is not None
-        aim, radius = goal, self.global_option.radius
+        assert option is not None
+        aim, radius = goal, option.radius
         if self.route is not None:
             aim = self.route(point, goal)
             radius = radius if aim is goal else 0.5 * radius
-        return Run(
-            self.global_option.id,
-            self.global_option,
-            None,
-            aim,
-            lambda point: math.dist(point, aim) <= radius,
-            self.timeout // 2,
-        )
+        return Run(option.id, option, None, aim, lambda point: math.dist(point, aim) <= radius, self.timeout // 2)
 
     def act(self, run: Run, observation: dict[str, np.ndarray]) -> np.ndarray:
         """Return what a running option does.
