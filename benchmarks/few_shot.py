@@ -124,7 +124,7 @@ def main() -> None:
             "version": __version__,
             "steps": list(range(0, args.total + 1, args.stretch)),
             "success_rate": [summary([r["curve"][i] for r in runs]) for i in range(len(run["curve"]))],
-            "old_pairs_lost": summary([r["old_before"] - r["old_after"] for r in runs]),
+            "old_pairs_lost": summary([r["old_before"] - r["old_after"] for r in runs], lowest=-1.0),
             "runs": runs,
         }
         args.out.parent.mkdir(parents=True, exist_ok=True)

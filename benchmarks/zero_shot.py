@@ -104,11 +104,11 @@ def by_path_length(pairs: list[Any]) -> dict[str, list[float]]:
     return bins
 
 
-def summary(rates: list[float]) -> dict[str, Any]:
-    """Return the mean of the seeds' rates, its standard error and a 95 % t interval."""
+def summary(rates: list[float], lowest: float = 0.0) -> dict[str, Any]:
+    """Return the mean of the seeds' rates (or their differences, which may be negative), standard error, 95 % t interval."""
     mean, error = float(np.mean(rates)), float(stats.sem(rates)) if len(rates) > 1 else float("nan")
     half = float(stats.t.ppf(0.975, len(rates) - 1)) * error if len(rates) > 1 else float("nan")
-    return {"mean": mean, "standard_error": error, "interval": [max(0.0, mean - half), min(1.0, mean + half)]}
+    return {"mean": mean, "standard_error": error, "interval": [max(lowest, mean - half), min(1.0, mean + half)]}
 
 
 def main() -> None:
@@ -134,7 +134,7 @@ def main() -> None:
             "command": "python -m benchmarks.zero_shot " + shlex.join(sys.argv[1:]),
             "version": __version__,
             **{name: summary([r[name] for r in runs]) for name in RATES},
-            "planning_on_minus_off": summary([r["success_rate"] - r["success_rate_planning_off"] for r in runs]),
+            "planning_on_minus_off": summary([r["success_rate"] - r["success_rate_planning_off"] for r in runs], lowest=-1.0),
             "calibration": calibration(runs),
             "runs": runs,
         }
