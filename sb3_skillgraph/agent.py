@@ -63,8 +63,8 @@ class SkillGraphAgent(Assembly):
     :param option_class: SB3 off-policy class of the options' policies
     :param option_kwargs: further keyword arguments for it
     :param option_view: what a policy sees of (observation, achieved goal, goal): ``"relative"`` (all, and the goal
-        relative to where the agent stands), ``"egocentric"`` (without absolute position) or a function; None takes the
-        one the environment names in its attribute ``option_view``, else ``"relative"``
+        relative to where the agent stands), ``"egocentric"`` (without absolute position), ``"body"`` (from a robot's body)
+        or a function; None takes the one the environment names in its attribute ``option_view``, else ``"relative"``
     :param option_timeout: environment steps an option may run [A.6]
     :param stall_steps: environment steps after which a run counts as failed that stands still; None for never
     :param event_radius: radius of salient events, in goal units; None takes the environment's ``success_radius`` or
@@ -77,6 +77,7 @@ class SkillGraphAgent(Assembly):
         (which the global option takes too while none of them is to be trained)
     :param saturation_penalty: weight, in the loss of ``OptionDDPG``'s and ``OptionTD3``'s actors, of the mean square of
         what their tanh is given: keeps them from getting stuck at the bounds of the actions
+    :param shaping: reward for every event radius of distance gained, beside -1 a step; 0 for none [2.1]
     :param hindsight: share of sampled transitions relabelled with a goal achieved later
     :param goal_tolerance: how near the global option must come to a goal, and any option to one put in by hindsight, for
         it to learn that it has reached it; in event radii
@@ -153,6 +154,7 @@ class SkillGraphAgent(Assembly):
         warm_start: bool = True,
         global_update_fraction: float = 0.5,
         saturation_penalty: float = 1e-4,
+        shaping: float = 0.0,
         hindsight: float = 0.8,
         goal_tolerance: float = 0.5,
         shared_experience: float = 0.5,
@@ -339,14 +341,14 @@ class SkillGraphAgent(Assembly):
     ) -> None:
         """Store the step once, and let everything learn from it."""
         assert isinstance(new_obs, dict)
+        stuck = np.array([bool(info.get("stuck")) for info in infos])
+        new_obs = self._start_over(new_obs, dones, stuck, infos)
         reached = with_terminal(new_obs, dones, infos)
-        if self._reset_options:
-            new_obs = self._start_over(new_obs, dones)
         check_finite(new_obs, self.num_timesteps)
         if reached is not new_obs:
             check_finite(reached, self.num_timesteps)
         with self._interrupts:
-            self._learn_from_step(reached, dones, infos)
+            self._learn_from_step(reached, dones, stuck, infos)
             self._last_obs = new_obs
             self._pending = None
             if self.pruning.due(self.curriculum.n_episodes):
@@ -359,17 +361,28 @@ class SkillGraphAgent(Assembly):
         self.pruning.prune(self.curriculum.n_episodes, running | practised)
         self._executed = [index for index in self._executed if index == GLOBAL or f"o{index}" in self.chaining.options]
 
-    def _start_over(self, new_obs: dict[str, np.ndarray], dones: np.ndarray) -> dict[str, np.ndarray]:
-        """Reset environments once more where they are to start: the VecEnv's own resets know no options."""
+    def _start_over(
+        self, new_obs: dict[str, np.ndarray], dones: np.ndarray, stuck: np.ndarray, infos: list[dict[str, Any]]
+    ) -> dict[str, np.ndarray]:
+        """Give up the episodes of agents that are stuck, and begin all where they are to begin while adapting."""
         assert self.env is not None
-        new_obs = {key: np.array(value) for key, value in new_obs.items()}
-        for i in np.flatnonzero(dones).tolist():
-            observation, _ = self.env.env_method("reset", options=self._reset_options, indices=i)[0]
+        given_up = stuck & ~dones
+        resets = given_up | dones if self._reset_options else given_up  # the VecEnv's own resets know no options
+        if not resets.any():
+            return new_obs
+        ended, new_obs = new_obs, {key: np.array(value) for key, value in new_obs.items()}
+        for i in np.flatnonzero(resets).tolist():
+            observation, _ = self.env.env_method("reset", options=self._reset_options or None, indices=i)[0]
+            if given_up[i]:
+                infos[i]["terminal_observation"] = {key: value[i] for key, value in ended.items()}
             for key in new_obs:
                 new_obs[key][i] = observation[key]
+        dones |= given_up  # in place: SB3 counts episodes by this array
         return new_obs
 
-    def _learn_from_step(self, reached: dict[str, np.ndarray], dones: np.ndarray, infos: list[dict[str, Any]]) -> None:
+    def _learn_from_step(
+        self, reached: dict[str, np.ndarray], dones: np.ndarray, stuck: np.ndarray, infos: list[dict[str, Any]]
+    ) -> None:
         step = self._pending
         assert step is not None
         before, points = step.observation["achieved_goal"], rows(reached, "achieved_goal")
@@ -385,9 +398,10 @@ class SkillGraphAgent(Assembly):
             step.aims,
             terminated,
             dones,
+            stuck,
         )
         self._held_actions, self._hold_left = step.held_actions, step.hold_left
-        self._state, outcomes = self.controller.advance(step.state, points, step.requests)
+        self._state, outcomes = self.controller.advance(step.state, points, step.requests, stuck)
         by_env = {outcome.env: outcome for outcome in outcomes}
         options = step.state.option.tolist()
         self._executed = sorted(set(options))
@@ -396,7 +410,7 @@ class SkillGraphAgent(Assembly):
             if index != GLOBAL:
                 self.controller.option(index).replay.add_rows(row[i : i + 1])
             self.visited.record(i, self.num_timesteps, points[i], done)
-            over[i] = self.curriculum.observe(i, before[i], points[i], by_env.get(i), done)
+            over[i] = self.curriculum.observe(i, before[i], points[i], by_env.get(i), done, bool(stuck[i]))
             if done:
                 self._hold_left[i] = 0
         if any(over):
@@ -436,6 +450,7 @@ class SkillGraphAgent(Assembly):
         for name, value in self.graph_summary().items():
             self.logger.record(f"skillgraph/{name}", value)
         self.logger.record("skillgraph/rejected_events", self.discovery.n_rejected)
+        self.logger.record("skillgraph/stuck", self.curriculum.n_stuck)
         super().dump_logs()
 
     def graph_summary(self) -> dict[str, float]:

@@ -59,6 +59,7 @@ class Assembly(Persistence):
             self.rng,
             dict(hindsight=args["hindsight"], shared=args["shared_experience"], horizon=args["option_timeout"]),
             self.device,
+            args["shaping"],
         )
         self.global_option = self._factory.make("global", None, None)
         self.policy = self.global_option.learner.policy

@@ -148,6 +148,15 @@ class DeepSkillChaining:
         self.chain_of[option.id].n_failures = 0
         self._learned(option, path[0], success=True)
 
+    def learn_stuck(self, option: Option) -> None:
+        """Let an option learn from a run in which the agent got stuck: it counts, but says nothing of where it began.
+
+        :param option: the option
+        """
+        option.failed(None)
+        if option.mature:
+            self.graph.refresh(option, False)
+
     def learn_failure(self, option: Option, start: np.ndarray) -> None:
         """Let an option learn from a run that timed out.
 

@@ -158,20 +158,22 @@ class Controller:
     # -- one step -----------------------------------------------------------------------------------------------------
 
     def advance(
-        self, state: ControllerState, points: np.ndarray, requests: Sequence[Request]
+        self, state: ControllerState, points: np.ndarray, requests: Sequence[Request], stuck: np.ndarray | None = None
     ) -> tuple[ControllerState, list[OptionOutcome]]:
-        """End the options that have reached their termination set or timed out.
+        """End the options that have reached their termination set or timed out, or whose agent is stuck.
 
         :param state: the state after the step
         :param points: where the agents stand, shape ``(n_envs, goal_dim)``
         :param requests: what each is to do
+        :param stuck: which agents can do nothing any more, shape ``(n_envs,)``; None for none
         :return: the state, undecided where an option ended; one outcome per option that ended
         """
+        lost = [False] * len(requests) if stuck is None else stuck.tolist()
         ended: list[tuple[int, bool]] = []
         for i, index in enumerate(state.option.tolist()):
             if index == UNDECIDED:
                 continue
-            what = self._fate(index, state, i, points[i], requests[i])
+            what = self._fate(index, state, i, points[i], requests[i], lost[i])
             if what != Fate.RUNNING:
                 ended.append((i, what == Fate.SUCCEEDED))
         if not ended:
@@ -179,12 +181,12 @@ class Controller:
         state = state.copy()
         return state, [self._end(state, i, success) for i, success in ended]
 
-    def _fate(self, index: int, state: ControllerState, i: int, point: np.ndarray, request: Request) -> Fate:
+    def _fate(self, index: int, state: ControllerState, i: int, point: np.ndarray, request: Request, stuck: bool) -> Fate:
         if index != GLOBAL and f"o{index}" not in self.chaining.options:
             return Fate.TIMED_OUT  # pruned meanwhile
         stalled = self.stall_steps is not None and int(state.still[i]) >= self.stall_steps
         timeout = 0 if stalled else self.timeout if index != GLOBAL else self.timeout // 2
-        return fate(self._reached(index, int(state.aim[i]), request, point), int(state.steps[i]), timeout)
+        return fate(self._reached(index, int(state.aim[i]), request, point), int(state.steps[i]), timeout, stuck)
 
     def _reached(self, index: int, aim: int, request: Request, point: np.ndarray) -> bool:
         if index != GLOBAL:

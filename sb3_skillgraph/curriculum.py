@@ -104,6 +104,7 @@ class Curriculum:
         self.rng = rng
         self._missions: list[Mission | None] = [None] * n_envs
         self.n_episodes = 0
+        self.n_stuck = 0
         self.pinned: str | None = None  # target of few-shot adaptation
         self._pinned_goal: np.ndarray | None = None  # the same, before it is an event
         self._paths: list[list[np.ndarray]] = [[] for _ in range(n_envs)]  # of the running option
@@ -174,7 +175,15 @@ class Curriculum:
         events = list(self.graph.events.values())
         self.visited.set_events(np.stack([e.center for e in events]), np.array([e.radius for e in events]))
 
-    def observe(self, env: int, before: np.ndarray, after: np.ndarray, outcome: OptionOutcome | None, done: bool) -> bool:
+    def observe(
+        self,
+        env: int,
+        before: np.ndarray,
+        after: np.ndarray,
+        outcome: OptionOutcome | None,
+        done: bool,
+        stuck: bool = False,
+    ) -> bool:
         """Learn from one environment step.
 
         :param env: which environment
@@ -182,14 +191,16 @@ class Curriculum:
         :param after: where it stands now (the last state of the episode, if it ended), as :class:`VisitedStates` has it
         :param outcome: what became of the option it ran, if that ended
         :param done: whether the episode ended
+        :param stuck: whether it was given up since the agent got stuck
         :return: whether the running option must be cut short, since the mission has changed
         """
         self._paths[env].append(before)
-        self._track_events(env, before, after)
+        if not stuck:
+            self._track_events(env, before, after)
         mission = self._missions[env]
         assert mission is not None
         if outcome is not None:
-            self._learn(env, outcome, after)
+            self._learn(env, outcome, after, stuck)
             mission.n_failures += not outcome.success
         was_exploring = mission.exploring
         over = self._mission_over(mission, after)
@@ -199,15 +210,18 @@ class Curriculum:
             self._paths[env] = []
         if done:
             self.n_episodes += 1
+            self.n_stuck += stuck
             self._since_event[env], self._last_event[env] = [], None
         return over or done or mission.exploring != was_exploring
 
-    def _learn(self, env: int, outcome: OptionOutcome, end: np.ndarray) -> None:
+    def _learn(self, env: int, outcome: OptionOutcome, end: np.ndarray, stuck: bool) -> None:
         if outcome.option == GLOBAL:
             return
         option = self.chaining.options[f"o{outcome.option}"]
         path = np.stack(self._paths[env])
-        if outcome.success:
+        if stuck:
+            self.chaining.learn_stuck(option)
+        elif outcome.success:
             self.chaining.learn_success(option, path, end)
         else:
             self.chaining.learn_failure(option, path[0])
@@ -384,6 +398,7 @@ class Curriculum:
         return {
             "missions": [None if mission is None else asdict(mission) for mission in self._missions],
             "n_episodes": self.n_episodes,
+            "n_stuck": self.n_stuck,
             "pinned": self.pinned,
             "paths": self._paths,
             "since_event": self._since_event,
@@ -393,7 +408,7 @@ class Curriculum:
     def set_state(self, state: dict[str, Any]) -> None:
         """Restore what :meth:`get_state` returned."""
         self._missions = [None if spec is None else Mission(**spec) for spec in state["missions"]]
-        self.n_episodes, self.pinned = state["n_episodes"], state["pinned"]
+        self.n_episodes, self.n_stuck, self.pinned = state["n_episodes"], state["n_stuck"], state["pinned"]
         self._paths, self._since_event = state["paths"], state["since_event"]
         self._last_event = state["last_event"]
         if self.graph.events:

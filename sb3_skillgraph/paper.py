@@ -37,4 +37,5 @@ PAPER: dict[str, Any] = dict(
     stall_steps=None,
     global_update_fraction=0.0,
     saturation_penalty=0.0,
+    shaping=0.0,
 )

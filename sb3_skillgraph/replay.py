@@ -36,6 +36,7 @@ class TransitionStore:
         # All columns side by side: a minibatch is gathered once. np.zeros is lazy: memory is taken as rows are written.
         self._data = np.zeros((self.capacity, ends[-1]), dtype=np.float32)
         self._terminated = np.zeros(self.capacity, dtype=bool)
+        self._stuck = np.zeros(self.capacity, dtype=bool)
         self._trajectory = np.zeros(self.capacity, dtype=np.int64)
         self._current = np.arange(n_envs, dtype=np.int64)
         self._n_trajectories = n_envs
@@ -59,6 +60,7 @@ class TransitionStore:
         goal: np.ndarray,
         terminated: np.ndarray,
         done: np.ndarray,
+        stuck: np.ndarray | None = None,
     ) -> np.ndarray:
         """Write one transition per environment.
 
@@ -70,6 +72,7 @@ class TransitionStore:
         :param goal: the goal that was pursued, shape ``(n_envs, goal_dim)``
         :param terminated: whether the environment ended for good (a time limit is no such end), shape ``(n_envs,)``
         :param done: whether the episode ended for any reason, shape ``(n_envs,)``
+        :param stuck: whether it was given up since the agent was stuck, shape ``(n_envs,)``; None for none
         :return: the numbers of the rows written, shape ``(n_envs,)``
         """
         position = self.total % self.capacity
@@ -77,6 +80,7 @@ class TransitionStore:
         values = (observation, achieved_goal, next_observation, next_achieved_goal, action, goal)
         np.concatenate(values, axis=1, out=self._data[block])
         self._terminated[block] = terminated
+        self._stuck[block] = False if stuck is None else stuck
         self._trajectory[block] = self._current
         rows = np.arange(self.total, self.total + self.n_envs)
         while self._n_trajectories > len(self._last_row):
@@ -112,6 +116,10 @@ class TransitionStore:
         """Tell after which rows the environment ended for good, shape ``(len(rows),)``."""
         return self._terminated[rows % self.capacity]
 
+    def stuck(self, rows: np.ndarray) -> np.ndarray:
+        """Tell after which rows the agent was stuck, shape ``(len(rows),)``."""
+        return self._stuck[rows % self.capacity]
+
     def cut(self) -> None:
         """End every running trajectory: what is written next does not follow from what was written last."""
         self._current = np.arange(self._n_trajectories, self._n_trajectories + self.n_envs, dtype=np.int64)
@@ -138,6 +146,7 @@ class TransitionStore:
             "capacity": self.capacity,
             "columns": {name: self.column(name, rows) for name in _COLUMNS},
             "terminated": self.terminated(rows),
+            "stuck": self.stuck(rows),
             "trajectory": self._trajectory[rows % self.capacity],
             "current": self._current,
             "n_trajectories": self._n_trajectories,
@@ -167,6 +176,7 @@ class TransitionStore:
         for name in _COLUMNS:
             self._data[at, self._slices[name]] = state["columns"][name]
         self._terminated[at] = state["terminated"]
+        self._stuck[at] = state["stuck"]
         self._trajectory[at] = state["trajectory"]
         self._current = np.array(state["current"])
         self._n_trajectories = int(state["n_trajectories"])
@@ -178,15 +188,44 @@ class TransitionStore:
 class OptionRule(NamedTuple):
     """What an option is paid for and where it ends (section 2.1): -1 a step, and 0 on reaching its goal, which ends it.
 
+    Where the agent gets stuck it pays what standing there forever would.
+
     ``reached(next_achieved_goal, goal, imagined)`` returns a bool array of shape ``(n,)``; ``imagined`` marks the
     transitions whose goal was put in by hindsight, for which reaching means coming within the radius of that goal.
+
+    :param reached: tells which transitions reach the goal
+    :param gamma: discount factor
+    :param shaping: further reward for a goal unit of distance gained; it is the change of a potential (Ng et al., 1999),
+        which changes no policy's rank
     """
 
     reached: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
+    gamma: float = 0.99
+    shaping: float = 0.0
 
-    def reward(self, reached: np.ndarray) -> np.ndarray:
-        """Return the reward for transitions that did or did not reach the goal, shape ``(n,)``."""
-        return np.where(reached, 0.0, -1.0).astype(np.float32)
+    def reward(
+        self,
+        reached: np.ndarray,
+        over: np.ndarray,
+        stuck: np.ndarray,
+        before: np.ndarray,
+        after: np.ndarray,
+        goal: np.ndarray,
+    ) -> np.ndarray:
+        """Return the reward for transitions, shape ``(n,)``.
+
+        :param reached: which reached the goal, shape ``(n,)``
+        :param over: after which there was no going on, for this or another reason, shape ``(n,)``
+        :param stuck: in which the agent got stuck, shape ``(n,)``
+        :param before: where the agent stood, shape ``(n, goal_dim)``
+        :param after: where it came to stand, same shape
+        :param goal: same shape
+        """
+        reward = np.where(reached, 0.0, np.where(stuck, -1.0 / max(1.0 - self.gamma, 1e-3), -1.0))
+        if self.shaping:
+            potential = self.gamma * np.linalg.norm(after - goal, axis=1) * ~over
+            reward += self.shaping * (np.linalg.norm(before - goal, axis=1) - potential)
+        return reward.astype(np.float32)
 
 
 class OptionReplay(ReplayBuffer):
@@ -287,13 +326,15 @@ class OptionReplay(ReplayBuffer):
         goal, next_achieved_goal = data["goal"], data["next_achieved_goal"]
         later = store.future(rows[imagined], self.horizon, rng)
         goal[imagined] = store.column("next_achieved_goal", later)
-        reached = self.rule.reached(next_achieved_goal, goal, imagined)
+        reached, stuck = self.rule.reached(next_achieved_goal, goal, imagined), store.stuck(rows)
+        over = reached | stuck | store.terminated(rows)
+        rewards = self.rule.reward(reached, over, stuck, data["achieved_goal"], next_achieved_goal, goal)
         return ReplayBufferSamples(
             observations=self._tensor(self.view(data["observation"], data["achieved_goal"], goal)),
             actions=self._tensor(data["action"]),
             next_observations=self._tensor(self.view(data["next_observation"], next_achieved_goal, goal)),
-            dones=self._tensor((reached | store.terminated(rows)).astype(np.float32)[:, None]),
-            rewards=self._tensor(self.rule.reward(reached)[:, None]),
+            dones=self._tensor(over.astype(np.float32)[:, None]),
+            rewards=self._tensor(rewards[:, None]),
         )
 
     def _tensor(self, array: np.ndarray) -> th.Tensor:

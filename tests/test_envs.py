@@ -556,6 +556,19 @@ def test_the_ant_has_the_torque_and_period_of_d4rl():
     assert env.observation_space["observation"].shape == (27,)
 
 
+def test_an_ant_on_its_back_is_stuck_until_the_reset():
+    env = make(ANT)
+    still = np.zeros(8, dtype=np.float32)
+    assert "stuck" not in env.reset(seed=0)[1]
+    assert "stuck" not in env.step(still)[4]
+    env.unwrapped.data.qpos[2:7] = [1.0, 0.0, 1.0, 0.0, 0.0]
+    for _ in range(30):
+        *_, terminated, truncated, info = env.step(still)
+        assert info["stuck"]
+        assert not (terminated or truncated)  # it is the agent that gives up
+    assert "stuck" not in env.reset()[1]
+
+
 def test_random_actions_rarely_flip_the_ant():
     env = make("SkillGraph/AntReacher-v0")
     env.action_space.seed(0)

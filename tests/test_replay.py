@@ -182,7 +182,8 @@ def walked_store(capacity: int = 400, n_steps: int = 60, n_envs: int = 2, seed: 
         following = point + rng.normal(0.3, 1.5, point.shape)
         done = rng.random(n_envs) < 0.1
         number = np.arange(store.total, store.total + n_envs, dtype=np.float32)[:, None]
-        store.add(number, point, number, following, number, np.full((n_envs, 2), 1e4), done & (t % 3 > 0), done)
+        terminated, stuck = done & (t % 3 > 0), done & (t % 3 == 2)
+        store.add(number, point, number, following, number, np.full((n_envs, 2), 1e4), terminated, done, stuck)
         point = np.where(done[:, None], 0.0, following)
     return store
 
@@ -219,8 +220,9 @@ def check_relabelling(store: TransitionStore, samples: ReplayBufferSamples, *, e
             reached = np.linalg.norm(end - goals[i]) <= RADIUS
         else:
             reached = np.linalg.norm(end - EVENT.center) <= EVENT.radius
-        assert samples.rewards[i, 0] == (0.0 if reached else -1.0)
-        assert samples.dones[i, 0] == float(reached or store.terminated(number)[0])
+        stuck = store.stuck(number)[0]
+        assert samples.rewards[i, 0] == pytest.approx(0.0 if reached else -100.0 if stuck else -1.0)
+        assert samples.dones[i, 0] == float(reached or stuck or store.terminated(number)[0])
     achieved = {tuple(point) for point in store.column("next_achieved_goal", np.arange(store.oldest, store.total))}
     assert {tuple(goal) for goal in goals[imagined]} <= achieved
     return imagined
@@ -255,6 +257,30 @@ def test_both_outcomes_occur_in_the_walks() -> None:
     reached, done = samples.rewards.numpy() == 0.0, samples.dones.numpy() == 1.0
     outcomes = {(bool(r), bool(d)) for r, d in zip(reached, done, strict=True)}
     assert outcomes == {(False, False), (True, True), (False, True)}
+
+
+@pytest.mark.parametrize("gamma", [0.9, 0.99])
+@pytest.mark.parametrize("ending", ["reached", "stuck", "terminated", "going on"])
+def test_shaping_changes_a_return_by_where_it_begins_alone(ending: str, gamma: float) -> None:
+    """Whatever way is taken: so no policy is better or worse for it."""
+    goal, n = np.array([3.0, -1.0]), 12
+    plain, shaped = goal_rule(RADIUS, gamma), goal_rule(RADIUS, gamma, 2.0)
+    for seed in range(3):
+        points = np.concatenate([np.zeros((1, 2)), np.random.default_rng(seed).normal(size=(n, 2))])
+        last = np.arange(n) == n - 1
+        flags = (last & (ending == "reached"), last & (ending != "going on"), last & (ending == "stuck"))
+        step = (*flags, points[:-1], points[1:], np.tile(goal, (n, 1)))
+        extra = (gamma ** np.arange(n)) @ (shaped.reward(*step) - plain.reward(*step))
+        left = gamma**n * 2.0 * np.linalg.norm(points[-1] - goal) if ending == "going on" else 0.0
+        assert extra + left == pytest.approx(2.0 * np.linalg.norm(goal), rel=1e-4)
+
+
+def test_getting_stuck_costs_what_standing_there_forever_would() -> None:
+    points, yes = np.zeros((1, 2)), np.ones(1, dtype=bool)
+    for gamma in (0.9, 0.99):
+        reward = goal_rule(RADIUS, gamma).reward(~yes, yes, yes, points, points, points + 5.0)
+        assert reward == pytest.approx(-sum(gamma**t for t in range(10_000)), rel=1e-4)
+    assert np.isfinite(goal_rule(RADIUS, 1.0).reward(~yes, yes, yes, points, points, points)).all()
 
 
 @pytest.mark.parametrize("shared", [0.0, 0.25, 1.0])

@@ -24,6 +24,7 @@ with contextlib.redirect_stderr(io.StringIO()):
 _POINT_CELL_SIZE, _ANT_CELL_SIZE = 1.0, 4.0
 _ANT_TORQUE = 30.0
 _ANT_FRAME_SKIP = 10
+_UPRIGHT = 0.2  # upward component of the torso's axis below which it lies on its side or back
 _FULL_STATE = mujoco.mjtState.mjSTATE_INTEGRATION
 _temporary_directory_lock = threading.Lock()
 
@@ -133,7 +134,8 @@ class AntMazeEnv(MujocoMazeTask, ant_maze_v5.AntMazeEnv):
 
     Body and model are those of gymnasium-robotics' ``AntMaze-v5`` without contact forces: the observation has 27
     numbers (height, orientation as a quaternion, 8 joint angles, the torso's velocities, joint velocities) and leaves
-    out x and y, which are the achieved goal.
+    out x and y, which are the achieved goal. ``info["stuck"]`` is there, and True, once it has fallen on its back, from
+    where it cannot get up.
 
     Torque and control period are those of D4RL's ant: an action in [-1, 1] is a torque in [-30, 30] instead of
     [-150, 150], held for 0.1 s instead of 0.05 s (10 simulator steps of 0.01 s instead of 5). With the strong motors
@@ -151,7 +153,7 @@ class AntMazeEnv(MujocoMazeTask, ant_maze_v5.AntMazeEnv):
         "render_modes": ["human", "rgb_array", "depth_array"],
         "render_fps": 10,
     }
-    option_view = "relative"
+    option_view = "body"
     # The ant is always reset facing along x, its feet 0.88 m away from the centre on both axes.
     body_radius = 0.9
     start_margin = 0.9
@@ -182,6 +184,11 @@ class AntMazeEnv(MujocoMazeTask, ant_maze_v5.AntMazeEnv):
 
     def _observe(self) -> Observation:
         return self._get_obs(self.ant_env._get_obs())
+
+    def _make_info(self, success: bool) -> dict[str, Any]:
+        _, x, y, _ = self.ant_env.data.qpos[3:7].tolist()
+        info = super()._make_info(success)
+        return info if 1.0 - 2.0 * (x * x + y * y) > _UPRIGHT else {**info, "stuck": True}
 
 
 def make_geometry(maze_map: MazeMap | None, cell_size: float) -> MazeGeometry:

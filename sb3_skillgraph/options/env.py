@@ -17,7 +17,8 @@ class OptionEnv(gym.Wrapper):
     """A goal environment with the reward and the end of one option (section 2.1).
 
     ``DDPG("MlpPolicy", OptionEnv(env, event)).learn(10_000)`` trains a policy for the option by itself. The reward is -1
-    a step and 0 on reaching the termination set, which ends the episode; after ``timeout`` steps it is truncated. The
+    a step and 0 on reaching the termination set, which ends the episode; after ``timeout`` steps it is truncated. An
+    agent that is stuck (``info["stuck"]``) ends it too, and pays -100: a hundred steps' worth, or for ever at 0.99. The
     next episode of the option goes on where the last one ended: the wrapped environment is reset only when its own
     episode is over or has not begun.
 
@@ -82,16 +83,19 @@ class OptionEnv(gym.Wrapper):
         :param action: action of the wrapped environment
         :return: what the policy sees, reward, whether the option succeeded, whether it was cut off, info
         """
+        assert self._last is not None, "Call reset before step."
         observation, _, terminated, truncated, info = self.env.step(action)
         self._steps += 1
-        point = np.asarray(observation["achieved_goal"])
-        ended = fate(self.termination.holds(point), self._steps, self.timeout)
-        success = ended == Fate.SUCCEEDED
-        self._last = None if terminated or truncated else observation
+        before, after = (np.asarray(obs["achieved_goal"]) for obs in (self._last, observation))
+        ended = fate(self.termination.holds(after), self._steps, self.timeout, bool(info.get("stuck")))
+        success, stuck = ended == Fate.SUCCEEDED, ended == Fate.STUCK
+        over = success or stuck or terminated
+        reached, ended_here, lost = np.array([success, over, stuck])[:, None]
+        reward = float(self.rule.reward(reached, ended_here, lost, before[None], after[None], self.goal[None])[0])
+        self._last = None if stuck or terminated or truncated else observation
         info["is_success"] = success
-        reward = float(self.rule.reward(np.array([success]))[0])
         cut = not success and (ended == Fate.TIMED_OUT or truncated)
-        return self._see(observation), reward, success or terminated, cut, info
+        return self._see(observation), reward, over, cut, info
 
     def _see(self, observation: dict[str, np.ndarray]) -> np.ndarray:
         rows = [np.asarray(observation[key], dtype=np.float32).reshape(1, -1) for key in ("observation", "achieved_goal")]

@@ -28,6 +28,7 @@ class OptionFactory:
     :param rng: random generator
     :param replay_kwargs: ``hindsight``, ``shared`` and ``horizon`` of :class:`OptionReplay`
     :param device: torch device
+    :param shaping: reward for every event radius of distance gained
     """
 
     def __init__(
@@ -42,6 +43,7 @@ class OptionFactory:
         rng: np.random.Generator,
         replay_kwargs: dict[str, Any],
         device: th.device,
+        shaping: float = 0.0,
     ) -> None:
         self.option_class = option_class
         self.option_kwargs = option_kwargs
@@ -53,6 +55,7 @@ class OptionFactory:
         self.rng = rng
         self.replay_kwargs = replay_kwargs
         self.device = device
+        self.shaping = shaping
         self._low = action_space.low.ravel()
         self._half = 0.5 * (action_space.high.ravel() - self._low)
         dim = view.dim(store.column("observation", np.arange(0)).shape[1], store.column("goal", np.arange(0)).shape[1])
@@ -71,7 +74,11 @@ class OptionFactory:
         :return: the option, gestating
         """
         everything = termination is None
-        rule = goal_rule(self.tolerance) if termination is None else termination_rule(termination, self.tolerance)
+        pay = dict(gamma=self.option_kwargs.get("gamma", 0.99), shaping=self.shaping / self.radius)
+        if termination is None:
+            rule = goal_rule(self.tolerance, **pay)
+        else:
+            rule = termination_rule(termination, self.tolerance, **pay)
         replay = OptionReplay(
             self.store,
             self.view,

@@ -121,14 +121,15 @@ class Option:
             self.record.append(True)
             self.effects.append(np.asarray(end, dtype=np.float64))
 
-    def failed(self, start: np.ndarray) -> None:
-        """Learn from a run that timed out.
+    def failed(self, start: np.ndarray | None) -> None:
+        """Learn from a run that failed.
 
-        :param start: the state it began in, shape ``(goal_dim,)``
+        :param start: the state it began in, shape ``(goal_dim,)``; None if that was not to blame: the agent got stuck
         """
         self.n_runs += 1
         self.record.append(False)
-        self.initiation.add_failure(start)
+        if start is not None:
+            self.initiation.add_failure(start)
 
     def get_state(self) -> dict[str, Any]:
         """Return all but the learner's networks as plain data."""
@@ -154,10 +155,12 @@ class Option:
         self.learner._n_updates = state["n_updates"]
 
 
-def goal_rule(radius: float) -> OptionRule:
+def goal_rule(radius: float, gamma: float = 0.99, shaping: float = 0.0) -> OptionRule:
     """Return the rule of an option that is given its goal: it ends within ``radius`` of it.
 
     :param radius: distance in goal units
+    :param gamma: see :class:`~sb3_skillgraph.replay.OptionRule`
+    :param shaping: likewise
     :return: the rule of the global option, and of every transition relabelled in hindsight
     """
 
@@ -165,14 +168,16 @@ def goal_rule(radius: float) -> OptionRule:
         offset = achieved_goal - goal
         return np.einsum("ij,ij->i", offset, offset) <= radius**2
 
-    return OptionRule(reached)
+    return OptionRule(reached, gamma, shaping)
 
 
-def termination_rule(termination: TerminationSet, radius: float) -> OptionRule:
+def termination_rule(termination: TerminationSet, radius: float, gamma: float = 0.99, shaping: float = 0.0) -> OptionRule:
     """Return the rule of an option with a termination set of its own.
 
     :param termination: where the option ends
     :param radius: radius of a goal put in by hindsight, in goal units
+    :param gamma: see :class:`~sb3_skillgraph.replay.OptionRule`
+    :param shaping: likewise
     :return: the rule
     """
     near_goal = goal_rule(radius)
@@ -182,4 +187,4 @@ def termination_rule(termination: TerminationSet, radius: float) -> OptionRule:
         hit[~imagined] = termination.contains(achieved_goal[~imagined])
         return hit
 
-    return OptionRule(reached)
+    return OptionRule(reached, gamma, shaping)

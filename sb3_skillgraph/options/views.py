@@ -6,6 +6,8 @@ import numpy as np
 
 View = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
+DISTANCE_UNIT = 0.2  # scale of the body view's distances, which are otherwise up to tens of event radii
+
 
 def relative_view(observation: np.ndarray, achieved_goal: np.ndarray, goal: np.ndarray) -> np.ndarray:
     """See everything, and the goal from where the agent stands.
@@ -31,7 +33,47 @@ def egocentric_view(observation: np.ndarray, achieved_goal: np.ndarray, goal: np
     return np.concatenate([observation[:, achieved_goal.shape[1] :], goal - achieved_goal], axis=1)
 
 
-VIEWS: dict[str, View] = {"relative": relative_view, "egocentric": egocentric_view}
+def body_view(observation: np.ndarray, achieved_goal: np.ndarray, goal: np.ndarray) -> np.ndarray:
+    """See everything from the body: for robots of MuJoCo that move freely, such as Gymnasium's ant.
+
+    Neither position nor heading is seen, and velocity and goal are turned by the heading: what has been learned in one
+    place and direction holds in all. The observation must be what such a robot's positions and velocities are without x
+    and y: height, quaternion, n joint angles, 3 velocities, 3 angular velocities, n joint velocities.
+
+    :param observation: shape ``(m, 11 + 2 * n)``
+    :param achieved_goal: shape ``(m, 2)``
+    :param goal: shape ``(m, 2)``
+    :return: shape ``(m, 13 + 2 * n)``: height, which way is up, joint angles, velocities, direction of the goal and
+        distance from it
+    :raises ValueError: if observation or goals have other lengths
+    """
+    n_joints, odd = divmod(observation.shape[1] - 11, 2)
+    if odd or n_joints < 0 or goal.shape[1] != 2:
+        raise ValueError(
+            "option_view='body' is for free bodies of MuJoCo: goals are positions (x, y), the observation is height, "
+            "quaternion, joint angles and all velocities. Here an observation has "
+            f"{observation.shape[1]} numbers and a goal {goal.shape[1]}."
+        )
+    w, x, y, z = observation[:, 1:5].T
+    heading = np.stack([1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z)], axis=1)
+    heading /= np.maximum(np.sqrt((heading**2).sum(axis=1, keepdims=True)), 1e-6)
+    up = np.stack([2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)], axis=1)
+    joints, velocity, rest = np.split(observation[:, 5:], [n_joints, n_joints + 2], axis=1)
+    offset = goal - achieved_goal
+    distance = np.sqrt((offset**2).sum(axis=1, keepdims=True))
+    direction = _turned(offset / np.maximum(distance, 1e-6), heading)
+    seen = [observation[:, :1], up, joints, _turned(velocity, heading), rest, direction, DISTANCE_UNIT * distance]
+    return np.concatenate(seen, axis=1)
+
+
+def _turned(vectors: np.ndarray, heading: np.ndarray) -> np.ndarray:
+    """Return what vectors are seen from a heading, shapes ``(m, 2)``."""
+    cosine, sine = heading.T
+    forward, left = vectors.T
+    return np.stack([cosine * forward + sine * left, cosine * left - sine * forward], axis=1)
+
+
+VIEWS: dict[str, View] = {"relative": relative_view, "egocentric": egocentric_view, "body": body_view}
 
 
 class ScaledView:

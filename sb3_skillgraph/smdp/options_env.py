@@ -206,7 +206,8 @@ class OptionsEnv(gym.Wrapper):
             total += discount * float(reward)
             discount *= self.gamma
             tau += 1
-            what = fate(run.reached(np.asarray(observation["achieved_goal"])), tau, run.timeout)
+            what = fate(run.reached(np.asarray(observation["achieved_goal"])), tau, run.timeout, bool(info.get("stuck")))
+            terminated = terminated or what == Fate.STUCK
             if what != Fate.RUNNING or terminated or truncated:
                 break
         info = {**info, "tau": tau, "discount": discount, "option": run.id, "option_success": what == Fate.SUCCEEDED}

@@ -1,0 +1,166 @@
+"""Agents that can do nothing any more, as their environment tells in ``info["stuck"]``."""
+
+import copy
+import csv
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from builders import World
+from conftest import TOY, Recorder, check_store, differences, new_agent, state_of, without_clock
+from stable_baselines3.common.logger import configure
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
+
+from sb3_skillgraph import OptionEnv, OptionsEnv, SkillGraphAgent
+from sb3_skillgraph.controller import GLOBAL, ControllerState, Request
+from sb3_skillgraph.events import SalientEvent
+
+PIT, DEPTH = np.array([0.0, 1.4]), 0.35  # beside the way from the toy maze's start
+
+
+class Pit(gym.Wrapper):
+    """Whoever falls into it stays there, until the reset."""
+
+    def in_pit(self, observation: Any) -> bool:
+        return bool(np.linalg.norm(observation["achieved_goal"] - PIT) < DEPTH)
+
+    def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
+        observation, info = self.env.reset(**kwargs)
+        self.stuck = self.in_pit(observation)
+        return observation, info
+
+    def step(self, action: np.ndarray) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        observation, reward, terminated, truncated, info = self.env.step(np.zeros(2) if self.stuck else action)
+        self.stuck = self.in_pit(observation)
+        return observation, reward, terminated, truncated, {**info, "stuck": self.stuck}
+
+
+def pit_env(**kwargs: Any) -> gym.Env:
+    return Recorder(Pit(gym.make(TOY, **kwargs)))
+
+
+def pits(n_envs: int) -> VecEnv:
+    return DummyVecEnv([pit_env for _ in range(n_envs)])
+
+
+def in_pit(points: np.ndarray) -> np.ndarray:
+    return np.linalg.norm(points - PIT, axis=1) < DEPTH
+
+
+@pytest.mark.parametrize("n_envs", [1, 2])
+def test_the_episode_is_given_up(n_envs: int, tmp_path: Any) -> None:
+    env = pits(n_envs)
+    agent = new_agent(env)
+    agent.set_logger(configure(str(tmp_path), ["csv"]))
+    agent.learn(1000, log_interval=1_000)
+    n_stuck = 0
+    for i, inner in enumerate(env.envs):
+        recorder = inner
+        while not isinstance(recorder, Recorder):
+            recorder = recorder.env
+        check_store(agent, recorder.transitions, i)
+        ends = np.array([step["next_achieved_goal"] for step in recorder.transitions])
+        starts = np.array([step["achieved_goal"] for step in recorder.transitions])
+        fallen = in_pit(ends)
+        assert not in_pit(starts).any()  # nobody goes on from there
+        n_stuck += int(fallen.sum())
+        rows = np.arange(agent.store.total)[i::n_envs]
+        np.testing.assert_array_equal(agent.store.stuck(rows), fallen)
+        assert not (agent.store.terminated(rows) & ~fallen).any()
+        later = agent.store.future(rows[np.flatnonzero(fallen)], 50, np.random.default_rng(0))
+        np.testing.assert_array_equal(later, rows[np.flatnonzero(fallen)])  # no trajectory leads out of it
+    assert n_stuck > 3
+    assert agent.curriculum.n_stuck == n_stuck
+    agent.dump_logs()
+    with open(tmp_path / "progress.csv") as file:
+        assert float(list(csv.DictReader(file))[-1]["skillgraph/stuck"]) == n_stuck
+    assert agent._episode_num == agent.curriculum.n_episodes >= n_stuck
+
+
+def test_where_a_run_began_is_not_to_blame(trained: SkillGraphAgent) -> None:
+    option = next(option for option in trained.options if option.mature and option.success_rate() > 0.5)
+    chain = trained.chaining.chain_of[option.id]
+
+    def learned() -> Any:
+        return copy.deepcopy((option.initiation.get_state(), dict(trained.graph.evidence), vars(chain)))
+
+    before, rate = learned(), option.success_rate()
+    for _ in range(3):
+        trained.chaining.learn_stuck(option)
+    assert differences(learned(), before) == []
+    assert option.success_rate() < rate  # but it did fail, and its edges know
+    rates = [data["success_rate"] for _, end, data in trained.graph.nx.edges(data=True) if end == option.target]
+    assert rates
+    assert list(option.record)[-3:] == [False] * 3
+
+
+def test_nothing_is_learned_of_ways_into_the_pit() -> None:
+    agent = new_agent(pit_env()).learn(1500, log_interval=None)
+    assert agent.curriculum.n_stuck > 3
+    assert any(option.mature for option in agent.options)
+    for option in agent.options:
+        for points in (*option.initiation.successes, np.array(option.effects).reshape(-1, 2)):
+            assert not in_pit(np.asarray(points)).any()
+
+
+@pytest.mark.parametrize("option", [1, GLOBAL])
+def test_being_stuck_ends_an_option_as_failed_even_where_it_leads(option: int) -> None:
+    world = World()
+    world.line()
+    goal = world.graph.events["e1"].center
+    request = [Request(goal, event="e1")]
+    running = ControllerState.fresh(1)._replace(option=np.array([option]), steps=np.array([3]))
+    for point in (goal[None] - 5.0, goal[None]):
+        state, outcomes = world.controller.advance(running, point, request, np.array([True]))
+        assert outcomes == [(0, option, -1, False, 3)]
+        assert state.option.tolist() == [-1]
+
+
+def test_learning_resumes_exactly(tmp_path: Any) -> None:
+    whole = new_agent(pit_env()).learn(1200, log_interval=None)
+    half = new_agent(pit_env()).learn(600, log_interval=None)
+    assert 0 < half.curriculum.n_stuck < whole.curriculum.n_stuck
+    half.save(tmp_path / "agent.zip")
+    half.save_replay_buffer(tmp_path / "replay.zip")
+    resumed = SkillGraphAgent.load(tmp_path / "agent.zip", env=half.get_env())
+    resumed.load_replay_buffer(tmp_path / "replay.zip")
+    resumed.learn(600, reset_num_timesteps=False, log_interval=None)
+    assert differences(without_clock(state_of(resumed)), without_clock(state_of(whole))) == []
+
+
+def test_adaptation_starts_over_where_it_is_told_to() -> None:
+    env = pit_env()
+    agent = new_agent(env).learn(600, log_interval=None)
+    before, given_up = len(env.starts), agent.curriculum.n_stuck
+    start = PIT - [DEPTH + 0.02, 0.0]
+    agent.adapt(PIT, start=start, total_timesteps=400)
+    assert agent.curriculum.n_stuck > given_up
+    begun = np.array(env.starts[before:])
+    exact = np.all(np.abs(begun - start) < 1e-6, axis=1)
+    assert exact.sum() >= agent.curriculum.n_stuck - given_up
+
+
+def test_option_env_ends_and_is_reset() -> None:
+    base = pit_env()
+    env = OptionEnv(base, SalientEvent("far", np.array([1.0, 1.0]), 0.2))
+    env.reset(seed=0, options={"start": PIT - [DEPTH + 0.1, 0.0]})
+    over = False
+    while not over:
+        _, reward, over, truncated, info = env.step(np.array([1.0, 0.0], dtype=np.float32))
+    assert (reward, truncated, info["is_success"]) == (pytest.approx(-100.0), False, False)
+    n_starts = len(base.starts)
+    env.reset()
+    assert len(base.starts) == n_starts + 1
+
+
+def test_options_env_ends_its_episode(trained: SkillGraphAgent) -> None:
+    env = OptionsEnv(pit_env(), trained.options, gamma=0.9)
+    env.reset(seed=0, options={"start": PIT - [DEPTH + 0.1, 0.0]})
+    over = False
+    while not over:
+        mask = env.action_masks()
+        assert mask[-5]
+        _, _, over, truncated, info = env.step(env.max_options - 5)  # along x
+    assert info["stuck"]
+    assert not truncated
