@@ -221,7 +221,7 @@ class OptionRule(NamedTuple):
         :param after: where it came to stand, same shape
         :param goal: same shape
         """
-        reward = np.where(reached, 0.0, np.where(stuck, -1.0 / max(1.0 - self.gamma, 1e-3), -1.0))
+        reward = np.where(stuck, -1.0 / max(1.0 - self.gamma, 1e-3), np.where(reached, 0.0, -1.0))
         if self.shaping:
             potential = self.gamma * np.linalg.norm(after - goal, axis=1) * ~over
             reward += self.shaping * (np.linalg.norm(before - goal, axis=1) - potential)

@@ -6,11 +6,12 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from conftest import TOY
-from stable_baselines3 import DDPG, HerReplayBuffer
+from stable_baselines3 import DDPG, TD3, HerReplayBuffer
 
 from sb3_skillgraph import evaluate_pairs
-from sb3_skillgraph.baselines import CoveringOptions, GoalSchedule, make_her, make_uvfa
+from sb3_skillgraph.baselines import CoveringOptions, GoalSchedule, OptionTask, make_her, make_recipe, make_uvfa
 from sb3_skillgraph.baselines.covering_options import TERMINATION_SHARE, LowEnd
+from sb3_skillgraph.options.option import goal_rule
 
 CORRIDOR = [[1] * 6, [1, "r", 0, 0, 0, 1], [1] * 6]
 
@@ -42,6 +43,44 @@ def test_hindsight_reaches_goals() -> None:
     model = make_her(toy(), seed=0, learning_starts=300, train_freq=(1, "step"))
     model.learn(3_000)
     assert evaluate_pairs(model, TOY, n_pairs=30).success_rate >= 0.4  # 0.7 in most seeds, a random walk 0.1
+
+
+class Sinks(gym.Wrapper):
+    """Says that the agent is stuck after three steps, wherever it stands."""
+
+    def reset(self, **kwargs: Any) -> Any:
+        self.n_steps = 0
+        return self.env.reset(**kwargs)
+
+    def step(self, action: np.ndarray) -> Any:
+        *step, info = self.env.step(action)
+        self.n_steps += 1
+        return *step, {**info, "stuck": self.n_steps == 3}
+
+
+def test_the_recipe_pays_as_options_are_paid() -> None:
+    task = OptionTask(Sinks(toy()), goal_rule(0.45, gamma=0.9, shaping=2.0))
+    goal = np.array([1.0, 1.0])
+    before = task.reset(seed=0, options={"start": [-1.0, 1.0], "goal": goal})[0]["achieved_goal"]
+    for n_steps in (1, 2, 3):
+        observation, reward, terminated, _, info = task.step(np.array([0.5, 0.0], dtype=np.float32))
+        after = observation["achieved_goal"]
+        left, now = np.linalg.norm(before - goal), np.linalg.norm(after - goal)
+        assert terminated == (n_steps == 3)
+        expected = 2.0 * left - 10.0 if terminated else 2.0 * (left - 0.9 * now) - 1.0
+        assert reward == pytest.approx(expected, rel=1e-5)
+        imagined = task.compute_reward(np.stack([after] * 2), np.stack([after, goal]), np.array([info] * 2))
+        assert imagined[1] == pytest.approx(reward)
+        assert imagined[0] == pytest.approx(2.0 * np.linalg.norm(after - before) + (-10.0 if terminated else 0.0), abs=1e-4)
+        before = after
+
+
+def test_the_recipe_learns_by_sb3s_own_classes() -> None:
+    model = make_recipe(toy(), seed=0, shaping=1.0, learning_starts=300, batch_size=64)
+    assert type(model) is TD3
+    assert isinstance(model.replay_buffer, HerReplayBuffer)
+    model.learn(2_000)
+    assert evaluate_pairs(model, TOY, n_pairs=30).success_rate >= 0.4
 
 
 class AnyStart(gym.Wrapper):

@@ -221,7 +221,7 @@ def check_relabelling(store: TransitionStore, samples: ReplayBufferSamples, *, e
         else:
             reached = np.linalg.norm(end - EVENT.center) <= EVENT.radius
         stuck = store.stuck(number)[0]
-        assert samples.rewards[i, 0] == pytest.approx(0.0 if reached else -100.0 if stuck else -1.0)
+        assert samples.rewards[i, 0] == pytest.approx(-100.0 if stuck else 0.0 if reached else -1.0)
         assert samples.dones[i, 0] == float(reached or stuck or store.terminated(number)[0])
     achieved = {tuple(point) for point in store.column("next_achieved_goal", np.arange(store.oldest, store.total))}
     assert {tuple(goal) for goal in goals[imagined]} <= achieved

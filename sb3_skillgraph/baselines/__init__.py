@@ -3,5 +3,6 @@
 from sb3_skillgraph.baselines.covering_options import CoveringOptions
 from sb3_skillgraph.baselines.goal_conditioned import GoalSchedule, make_her, make_uvfa
 from sb3_skillgraph.baselines.random_walk import RandomWalk
+from sb3_skillgraph.baselines.recipe import OptionTask, make_recipe
 
-__all__ = ["CoveringOptions", "GoalSchedule", "RandomWalk", "make_her", "make_uvfa"]
+__all__ = ["CoveringOptions", "GoalSchedule", "OptionTask", "RandomWalk", "make_her", "make_recipe", "make_uvfa"]

@@ -10,11 +10,11 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
-from stable_baselines3 import DDPG
+from stable_baselines3 import TD3
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_skillgraph.agent import SkillGraphAgent
-from sb3_skillgraph.baselines import CoveringOptions, RandomWalk, make_her, make_uvfa
+from sb3_skillgraph.baselines import CoveringOptions, OptionTask, RandomWalk, make_her, make_recipe, make_uvfa
 from sb3_skillgraph.evaluation import Predictor
 from sb3_skillgraph.hyperparams import check_hyperparams, load_hyperparams
 from sb3_skillgraph.plotting import event_links, near_links
@@ -145,13 +145,13 @@ class _Checks(BaseCallback):
 
 
 class GoalConditionedLearner(Learner):
-    """SB3's DDPG that is told the goal, with hindsight or without."""
+    """SB3's DDPG (which is a TD3 to SB3) that is told the goal, with hindsight or without."""
 
     make: Callable[..., Any]
 
     def __init__(self, env_id: str, env_kwargs: dict[str, Any], seed: int, arguments: dict[str, Any]) -> None:
         env = gym.make(env_id, **{"terminate_on_success": True, **env_kwargs})
-        self.policy: DDPG = type(self).make(env, seed=seed, **arguments)
+        self.policy: TD3 = type(self).make(env, seed=seed, **arguments)
 
     def learn(self, begin: int, end: int, every: int, check: Check) -> None:
         """Learn in one go."""
@@ -165,7 +165,7 @@ class GoalConditionedLearner(Learner):
         self.policy.save_replay_buffer(experience)
         model.seek(0)
         experience.seek(0)
-        twin = DDPG.load(model, env=env)
+        twin = type(self.policy).load(model, env=env)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # that the running episode is cut is meant
             twin.load_replay_buffer(experience)
@@ -185,6 +185,17 @@ class HERLearner(GoalConditionedLearner):
     """A new goal every episode, and in hindsight."""
 
     make = staticmethod(make_her)
+
+
+class RecipeLearner(GoalConditionedLearner):
+    """TD3 with hindsight on what the skill graph's options are given."""
+
+    make = staticmethod(make_recipe)
+
+    def practise(self, env: gym.Env, start: np.ndarray, goal: np.ndarray, stretches: list[int]) -> Iterator[Predictor]:
+        """Let a copy go on learning, paid as before."""
+        rule = self.policy.get_env().get_attr("rule")[0]  # type: ignore[union-attr]
+        yield from super().practise(OptionTask(env, rule), start, goal, stretches)
 
 
 class CoveringOptionsLearner(Learner):
@@ -237,6 +248,7 @@ ALGORITHMS: dict[str, type[Learner]] = {
     "skill_graph": SkillGraphLearner,
     "uvfa": UVFALearner,
     "her": HERLearner,
+    "recipe": RecipeLearner,
     "covering_options": CoveringOptionsLearner,
     "random_walk": RandomWalkLearner,
 }
