@@ -21,13 +21,13 @@ agent = SkillGraphAgent("MultiInputPolicy", gym.make(args.env), seed=0)
 agent.learn(args.steps, progress_bar=True)
 
 maze = gym.make(args.env, terminate_on_success=True)
-env = OptionsEnv(maze, agent.options, max_options=512, view=agent.view, route=agent.planner.route)
+env = OptionsEnv(maze, agent.options, max_options=512, route=agent.planner.route)
 observation, info = env.reset(seed=0)
 n_always = 1 + len(env.primitives)  # the global option and primitive actions
 print(f"{env.action_masks().sum() - n_always} of {len(agent.options)} options can run here, and {n_always} other actions")
 
 planner = GraphPolicy(agent.planner, env)
-learner = SMDPQLearning("MultiInputPolicy", Monitor(env), learning_starts=100, train_freq=1, seed=0)
+learner = SMDPQLearning("MultiInputPolicy", Monitor(env), learning_starts=100, seed=0)
 learner.learn(args.decisions, progress_bar=True)
 for name, policy in (("planning over the graph", planner), ("SMDP Q-learning", learner)):
     mean, deviation = evaluate_policy(policy, Monitor(env), n_eval_episodes=20)

@@ -10,6 +10,7 @@ from builders import make_option
 from conftest import TOY, new_agent
 from gymnasium import spaces
 from sb3_contrib import MaskablePPO
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
@@ -28,7 +29,7 @@ def agent() -> SkillGraphAgent:
 
 def lifted(agent: SkillGraphAgent, **kwargs: Any) -> OptionsEnv:
     env = gym.make(TOY, terminate_on_success=True, max_steps=200)
-    return OptionsEnv(env, agent.options, **{"gamma": GAMMA, "view": agent.view, **kwargs})
+    return OptionsEnv(env, agent.options, **{"gamma": GAMMA, **kwargs})
 
 
 def reset_somewhere(env: OptionsEnv, rng: np.random.Generator) -> dict[str, np.ndarray]:
@@ -52,7 +53,7 @@ class Steps(gym.Wrapper):
 
 def test_one_action_is_one_run_of_an_option(agent: SkillGraphAgent) -> None:
     steps = Steps(gym.make(TOY, max_steps=150))
-    env = OptionsEnv(steps, agent.options, gamma=GAMMA, view=agent.view)
+    env = OptionsEnv(steps, agent.options, gamma=GAMMA)
     assert env.action_space == spaces.Discrete(64)
     rng, ran = np.random.default_rng(0), set()
     for _ in range(15):
@@ -178,7 +179,7 @@ def test_what_it_refuses(agent: SkillGraphAgent) -> None:
 
 def test_the_global_option_may_be_among_the_options_or_missing(agent: SkillGraphAgent) -> None:
     goal = {"start": [-1.0, 1.0], "goal": [-1.0, 0.7]}
-    listed = OptionsEnv(gym.make(TOY), [agent.global_option, *agent.options], view=agent.view)
+    listed = OptionsEnv(gym.make(TOY), [agent.global_option, *agent.options])
     listed.reset(options=goal)
     assert (listed.global_action, listed.first_fixed) == (0, 59)
     assert listed.action_masks()[0]
@@ -187,6 +188,30 @@ def test_the_global_option_may_be_among_the_options_or_missing(agent: SkillGraph
     without.reset(options=goal)
     assert without.action_masks()[-5:].all()
     assert without.first_fixed == 59
+
+
+def test_options_need_not_be_the_agents_list(agent: SkillGraphAgent) -> None:
+    """They bring along what their policies see."""
+    whole, part = lifted(agent), lifted(agent)
+    part.options = [option for option in agent.options if option.mature]
+    for env in (whole, part):
+        env.reset(seed=0, options={"start": part.options[0].initiation.core})
+    action = whole.index(part.options[0].id)
+    if not whole.action_masks()[action]:
+        pytest.skip("it stands where the option leads")
+    there, here = whole.step(action), part.step(0)
+    np.testing.assert_array_equal(there[0]["achieved_goal"], here[0]["achieved_goal"])
+    with pytest.raises(ValueError, match="cannot be taken"):
+        part.step(-1)
+
+
+def test_plans_with_options_that_are_not_among_the_actions(agent: SkillGraphAgent) -> None:
+    env = OptionsEnv(gym.make(TOY), [], global_option=agent.global_option)
+    policy = GraphPolicy(agent.planner, env)
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        action, _ = policy.predict(reset_somewhere(env, rng))
+        assert action == env.global_action
 
 
 def test_monitor_counts_decisions_and_seeds_repeat(agent: SkillGraphAgent) -> None:
@@ -285,7 +310,7 @@ class SmallSMDP(gym.Env):
         return after, reward, {cls.WALK: 1, cls.LEAP: 5, cls.REST: 2}[action]
 
     def see(self) -> dict[str, np.ndarray]:
-        mask = np.array([1, self.state < 2, 1], dtype=np.int8)
+        mask = np.array([self.state < 3, self.state < 2, self.state < 3], dtype=np.int8)  # nothing where it is over
         return {"observation": np.eye(4, dtype=np.float32)[self.state], "action_mask": mask}
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict[str, np.ndarray], Any]:
@@ -357,6 +382,8 @@ def test_q_learning_without_masks_and_what_it_refuses() -> None:
     assert (model.replay_buffer.discounts == np.float32(model.gamma)).all()  # type: ignore[union-attr]
     with pytest.raises(ValueError, match="n_steps must be 1"):
         SMDPQLearning("MlpPolicy", "CartPole-v1", n_steps=3)
+    with pytest.raises(ValueError, match="takes no replay_buffer_class"):
+        SMDPQLearning("MlpPolicy", "CartPole-v1", replay_buffer_class=ReplayBuffer)
 
 
 def test_maskable_ppo_trains_on_it(agent: SkillGraphAgent) -> None:

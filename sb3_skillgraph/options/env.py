@@ -54,8 +54,8 @@ class OptionEnv(gym.Wrapper):
         self.goal = np.asarray(goal, dtype=np.float32)
         if self.goal.shape != space["achieved_goal"].shape:
             raise ValueError(f"The goal must have shape {space['achieved_goal'].shape}, not {self.goal.shape}.")
-        name = env.get_wrapper_attr("option_view") if env.has_wrapper_attr("option_view") else "relative"
-        self.view = ScaledView(VIEWS[name], termination.radius)
+        view = (env.get_wrapper_attr("option_view") if env.has_wrapper_attr("option_view") else None) or "relative"
+        self.view = ScaledView(view if callable(view) else VIEWS[view], termination.radius)
         self.rule = termination_rule(termination, termination.radius)
         dims = [int(np.prod(space[key].shape)) for key in ("observation", "achieved_goal")]  # type: ignore[arg-type]
         self.observation_space = spaces.Box(-np.inf, np.inf, (self.view.dim(*dims),), np.float32)

@@ -81,6 +81,10 @@ class GraphPolicy:
         avoid = [] if last.failed[i] < 0 else [self.env.options[last.failed[i]].id]
         legs = self.planner.legs(point, goal, avoid)
         path = legs[last.failures[i] // PATIENCE % len(legs)].path if legs else None
-        if path is not None and mask[action := self.env.index(path.vertices[0])]:
-            return action
-        return self.global_action
+        if path is None:
+            return self.global_action
+        try:
+            action = self.env.index(path.vertices[0])
+        except KeyError:  # made after the environment was given its options
+            return self.global_action
+        return action if mask[action] else self.global_action

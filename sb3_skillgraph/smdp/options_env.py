@@ -10,7 +10,6 @@ from gymnasium import spaces
 
 from sb3_skillgraph.options.execution import Fate, fate
 from sb3_skillgraph.options.option import Option
-from sb3_skillgraph.options.views import VIEWS, ScaledView
 
 MASK = "action_mask"
 Route = Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -46,7 +45,11 @@ class OptionsEnv(gym.Wrapper):
 
     Observations gain an entry ``action_mask``, which :meth:`action_masks` returns as well: an option may run if it is
     mature, stands in its (optimistic) initiation set and not yet in its termination set. Options may be appended to the
-    list at any time; actions of those still unborn are masked.
+    list at any time; actions of those still unborn are masked. (``agent.options`` is a new list every time: a later one
+    needs a new ``OptionsEnv``, whose actions may be others.)
+
+    Where the agent gets stuck (``info["stuck"]``) the episode is over, and costs are added up as if it stood there for
+    ever. A ``Monitor`` belongs around this environment, not into it: from inside it does not see such an end.
 
     :param env: a goal environment (Dict observations, Box actions)
     :param options: options, such as ``agent.options``, which knows the agent's global option; that one may be among them
@@ -56,7 +59,6 @@ class OptionsEnv(gym.Wrapper):
     :param max_options: number of actions: room for options and primitive actions
     :param gamma: discount factor per environment step
     :param timeout: environment steps an option may run; the global option, half of them
-    :param view: what the options' policies see; by default what the environment names in ``option_view``
     :param route: tells, given where the agent stands and its goal, where the global option is to go first; by default
         straight to the goal
     :raises ValueError: if the environment is no goal environment, nothing can always be done, or there is too little room
@@ -72,7 +74,6 @@ class OptionsEnv(gym.Wrapper):
         max_options: int = 64,
         gamma: float = 0.99,
         timeout: int = 200,
-        view: ScaledView | None = None,
         route: Route | None = None,
     ) -> None:
         super().__init__(env)
@@ -89,9 +90,6 @@ class OptionsEnv(gym.Wrapper):
         self.global_option: Option | None = global_option or listed or getattr(options, "global_option", None)
         self._is_listed = listed is not None
         self.primitives = self._find_primitives(env.action_space, primitives)
-        name = env.get_wrapper_attr("option_view") if env.has_wrapper_attr("option_view") else "relative"
-        radius = 1.0 if self.global_option is None else self.global_option.radius
-        self.view = view or ScaledView(VIEWS[name], radius)
         self.max_options = max_options
         self.action_space = spaces.Discrete(max_options)
         self.observation_space = spaces.Dict({**inner.spaces, MASK: spaces.MultiBinary(max_options)})
@@ -195,7 +193,7 @@ class OptionsEnv(gym.Wrapper):
         :return: observation, discounted sum of rewards, terminated, truncated, info
         :raises ValueError: if the action is masked
         """
-        if not self.action_masks()[int(action)]:
+        if not (0 <= action < self.max_options and self.action_masks()[int(action)]):
             raise ValueError(f"Action {action} cannot be taken here: see action_masks().")
         assert self._last is not None
         run = self.begin(self._last, int(action))
@@ -207,7 +205,9 @@ class OptionsEnv(gym.Wrapper):
             discount *= self.gamma
             tau += 1
             what = fate(run.reached(np.asarray(observation["achieved_goal"])), tau, run.timeout, bool(info.get("stuck")))
-            terminated = terminated or what == Fate.STUCK
+            if what == Fate.STUCK:
+                terminated = True
+                total += discount * min(float(reward), 0.0) / max(1.0 - self.gamma, 1e-3)
             if what != Fate.RUNNING or terminated or truncated:
                 break
         info = {**info, "tau": tau, "discount": discount, "option": run.id, "option_success": what == Fate.SUCCEEDED}
@@ -247,7 +247,8 @@ class OptionsEnv(gym.Wrapper):
             seen, point = (
                 np.asarray(observation[key], dtype=np.float32).reshape(1, -1) for key in ("observation", "achieved_goal")
             )
-            scaled = run.option.actor.act(self.view(seen, point, run.aim[None].astype(np.float32)))[0]
+            see = run.option.replay.view
+            scaled = run.option.actor.act(see(seen, point, run.aim[None].astype(np.float32)))[0]
         assert scaled is not None
         low, high = self._inner_space.low, self._inner_space.high
         return (low + 0.5 * (scaled.reshape(low.shape) + 1.0) * (high - low)).astype(self._inner_space.dtype)

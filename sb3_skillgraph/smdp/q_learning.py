@@ -46,10 +46,12 @@ class UnmaskedExtractor(CombinedExtractor):
     SB3's extractor for Dict observations, blind to the mask.
 
     :param observation_space: Dict space
+    :param kwargs: all other arguments of ``CombinedExtractor``
     """
 
-    def __init__(self, observation_space: spaces.Dict) -> None:
-        super().__init__(spaces.Dict({name: space for name, space in observation_space.spaces.items() if name != MASK}))
+    def __init__(self, observation_space: spaces.Dict, **kwargs: Any) -> None:
+        seen = spaces.Dict({name: space for name, space in observation_space.spaces.items() if name != MASK})
+        super().__init__(seen, **kwargs)
 
 
 class MaskedMultiInputPolicy(MaskedPolicy):
@@ -88,6 +90,10 @@ class _Discounts(ReplayBuffer):
         env_inds = np.random.randint(0, high=self.n_envs, size=(len(batch_inds),))  # noqa: NPY002
         np.random.set_state(state)  # noqa: NPY002
         samples = super()._get_samples(batch_inds, env)
+        following = samples.next_observations
+        if isinstance(following, dict) and MASK in following:
+            # Nothing may be left to do where an episode is over, and 0 times minus infinity is no number.
+            following[MASK] = th.maximum(following[MASK], samples.dones.to(following[MASK].dtype))
         return samples._replace(discounts=self.to_torch(self.discounts[batch_inds, env_inds].reshape(-1, 1)))
 
 
@@ -108,10 +114,13 @@ class SMDPQLearning(DQN):
     is each transition's discount (``gamma`` where there is none) and a Dict observation's ``action_mask`` its mask. Goals
     are part of the observation.
 
+    Decisions are fewer than environment steps: by default there is an update after each, and a new target network after
+    every 500.
+
     :param policy: ``MultiInputPolicy``, ``MlpPolicy`` or a policy class
     :param env: the environment (if registered in Gym, can be str)
     :param kwargs: all other arguments of ``stable_baselines3.DQN`` but ``replay_buffer_class``
-    :raises ValueError: if ``n_steps`` is not 1
+    :raises ValueError: if ``n_steps`` is not 1, or a ``replay_buffer_class`` is given
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
@@ -119,15 +128,17 @@ class SMDPQLearning(DQN):
         "MultiInputPolicy": MaskedMultiInputPolicy,
     }
 
-    def __init__(self, policy: str | type[DQNPolicy], env: Any, *args: Any, **kwargs: Any) -> None:
+    def __init__(self, policy: str | type[DQNPolicy], env: Any, **kwargs: Any) -> None:
         if kwargs.get("n_steps", 1) != 1:
             raise ValueError("SMDPQLearning takes one option at a time: n_steps must be 1.")
-        super().__init__(policy, env, *args, **kwargs)
+        if kwargs.get("replay_buffer_class") is not None:
+            raise ValueError("SMDPQLearning takes no replay_buffer_class: its own keeps the discounts.")
+        super().__init__(policy, env, **{"train_freq": 1, "target_update_interval": 500, **kwargs})
 
     def _setup_model(self) -> None:
         of_dict = isinstance(self.observation_space, spaces.Dict)
         self.replay_buffer_class = SMDPDictReplayBuffer if of_dict else SMDPReplayBuffer
-        self.replay_buffer_kwargs = {"gamma": self.gamma}
+        self.replay_buffer_kwargs = {**self.replay_buffer_kwargs, "gamma": self.gamma}
         super()._setup_model()
 
     def predict(
@@ -167,5 +178,7 @@ class SMDPQLearning(DQN):
             batched = self.policy.is_vectorized_observation(observation)
             first = next(iter(observation.values())) if isinstance(observation, dict) else observation
             mask = np.ones((len(first), self.action_space.n) if batched else int(self.action_space.n))
+        if not np.atleast_2d(mask).any(axis=1).all():
+            raise ValueError("The action mask of an observation is all zero: there must always be something that can be done.")
         chosen = [np.random.choice(np.flatnonzero(row)) for row in np.atleast_2d(mask)]  # noqa: NPY002
         return np.array(chosen) if mask.ndim == 2 else np.array(chosen[0])
