@@ -1,6 +1,7 @@
 """The agent: an SB3 off-policy algorithm that discovers, plans, chains and learns (section 3, Figure 10)."""
 
 import copy
+import time
 from typing import Any, ClassVar, Literal, NamedTuple, TypeVar
 
 import numpy as np
@@ -8,6 +9,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
@@ -372,13 +374,23 @@ class SkillGraphAgent(Assembly):
             return new_obs
         ended, new_obs = new_obs, {key: np.array(value) for key, value in new_obs.items()}
         for i in np.flatnonzero(resets).tolist():
-            observation, _ = self.env.env_method("reset", options=self._reset_options or None, indices=i)[0]
             if given_up[i]:
                 infos[i]["terminal_observation"] = {key: value[i] for key, value in ended.items()}
+                self._count_episode(i, infos[i])
+            observation, _ = self.env.env_method("reset", options=self._reset_options or None, indices=i)[0]
             for key in new_obs:
                 new_obs[key][i] = observation[key]
         dones |= given_up  # in place: SB3 counts episodes by this array
         return new_obs
+
+    def _count_episode(self, i: int, info: dict[str, Any]) -> None:
+        """Let SB3's statistics know of an episode that is given up: its Monitor counts only those that end."""
+        assert self.env is not None
+        if self.env.env_is_wrapped(Monitor, indices=i)[0]:
+            rewards = self.env.get_attr("rewards", indices=i)[0]
+            seconds = time.time() - self.env.get_attr("t_start", indices=i)[0]
+            info["episode"] = {"r": round(sum(rewards), 6), "l": len(rewards), "t": round(seconds, 6)}
+            self._update_info_buffer([info], np.ones(1, dtype=bool))
 
     def _learn_from_step(
         self, reached: dict[str, np.ndarray], dones: np.ndarray, stuck: np.ndarray, infos: list[dict[str, Any]]
@@ -409,7 +421,10 @@ class SkillGraphAgent(Assembly):
         for i, (index, done) in enumerate(zip(options, dones.tolist(), strict=True)):
             if index != GLOBAL:
                 self.controller.option(index).replay.add_rows(row[i : i + 1])
-            self.visited.record(i, self.num_timesteps, points[i], done)
+            if stuck[i]:
+                self.visited.end(i)  # no event is to lie where agents get stuck
+            else:
+                self.visited.record(i, self.num_timesteps, points[i], done)
             over[i] = self.curriculum.observe(i, before[i], points[i], by_env.get(i), done, bool(stuck[i]))
             if done:
                 self._hold_left[i] = 0

@@ -149,11 +149,12 @@ class DeepSkillChaining:
         self._learned(option, path[0], success=True)
 
     def learn_stuck(self, option: Option) -> None:
-        """Let an option learn from a run in which the agent got stuck: it counts, but says nothing of where it began.
+        """Let an option learn from a run in which the agent got stuck: it failed, but where it began is not to blame.
 
         :param option: the option
         """
         option.failed(None)
+        self._count_failure(self.chain_of[option.id])
         if option.mature:
             self.graph.refresh(option, False)
 
@@ -164,11 +165,13 @@ class DeepSkillChaining:
         :param start: the state it began in, shape ``(goal_dim,)``
         """
         option.failed(start)
-        chain = self.chain_of[option.id]
+        self._count_failure(self.chain_of[option.id])
+        self._learned(option, start, success=False)
+
+    def _count_failure(self, chain: SkillChain) -> None:
         chain.n_failures += 1
         if self.max_failures is not None and chain.open and chain.n_failures >= self.max_failures:
             chain.dropped = True
-        self._learned(option, start, success=False)
 
     def _learned(self, option: Option, start: np.ndarray, success: bool) -> None:
         chain = self.chain_of[option.id]

@@ -72,6 +72,14 @@ class VisitedStates:
         if done:
             self._cut(env_index)
 
+    def end(self, env_index: int) -> None:
+        """End the trajectory of one environment where it was recorded last.
+
+        :param env_index: which environment
+        """
+        self._places[env_index] = _NOWHERE
+        self._cut(env_index)
+
     def cut(self, n_envs: int) -> None:
         """End every running trajectory: what is recorded next does not follow from what was recorded last.
 

@@ -10,6 +10,7 @@ import pytest
 from builders import World
 from conftest import TOY, Recorder, check_store, differences, new_agent, state_of, without_clock
 from stable_baselines3.common.logger import configure
+from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from sb3_skillgraph import OptionEnv, OptionsEnv, SkillGraphAgent
@@ -41,7 +42,7 @@ def pit_env(**kwargs: Any) -> gym.Env:
 
 
 def pits(n_envs: int) -> VecEnv:
-    return DummyVecEnv([pit_env for _ in range(n_envs)])
+    return DummyVecEnv([lambda: Monitor(pit_env()) for _ in range(n_envs)])
 
 
 def in_pit(points: np.ndarray) -> np.ndarray:
@@ -72,7 +73,11 @@ def test_the_episode_is_given_up(n_envs: int, tmp_path: Any) -> None:
         np.testing.assert_array_equal(later, rows[np.flatnonzero(fallen)])  # no trajectory leads out of it
     assert n_stuck > 3
     assert agent.curriculum.n_stuck == n_stuck
+    lengths = [info["l"] for info in agent.ep_info_buffer]
+    assert len(lengths) == agent._episode_num  # SB3's statistics count them all
+    assert sum(length < 100 for length in lengths) == n_stuck
     agent.dump_logs()
+    agent.logger.close()
     with open(tmp_path / "progress.csv") as file:
         assert float(list(csv.DictReader(file))[-1]["skillgraph/stuck"]) == n_stuck
     assert agent._episode_num == agent.curriculum.n_episodes >= n_stuck
@@ -83,9 +88,9 @@ def test_where_a_run_began_is_not_to_blame(trained: SkillGraphAgent) -> None:
     chain = trained.chaining.chain_of[option.id]
 
     def learned() -> Any:
-        return copy.deepcopy((option.initiation.get_state(), dict(trained.graph.evidence), vars(chain)))
+        return copy.deepcopy((option.initiation.get_state(), dict(trained.graph.evidence), chain.options))
 
-    before, rate = learned(), option.success_rate()
+    before, rate, n_failures = learned(), option.success_rate(), chain.n_failures
     for _ in range(3):
         trained.chaining.learn_stuck(option)
     assert differences(learned(), before) == []
@@ -93,12 +98,15 @@ def test_where_a_run_began_is_not_to_blame(trained: SkillGraphAgent) -> None:
     rates = [data["success_rate"] for _, end, data in trained.graph.nx.edges(data=True) if end == option.target]
     assert rates
     assert list(option.record)[-3:] == [False] * 3
+    assert chain.n_failures == n_failures + 3
 
 
 def test_nothing_is_learned_of_ways_into_the_pit() -> None:
     agent = new_agent(pit_env()).learn(1500, log_interval=None)
     assert agent.curriculum.n_stuck > 3
     assert any(option.mature for option in agent.options)
+    assert not in_pit(agent.visited.points).any()  # where events are put
+    assert not in_pit(np.array([event.center for event in agent.events])).any()
     for option in agent.options:
         for points in (*option.initiation.successes, np.array(option.effects).reshape(-1, 2)):
             assert not in_pit(np.asarray(points)).any()
@@ -118,14 +126,14 @@ def test_being_stuck_ends_an_option_as_failed_even_where_it_leads(option: int) -
 
 
 def test_learning_resumes_exactly(tmp_path: Any) -> None:
-    whole = new_agent(pit_env()).learn(1200, log_interval=None)
-    half = new_agent(pit_env()).learn(600, log_interval=None)
+    whole = new_agent(pit_env()).learn(800, log_interval=None)
+    half = new_agent(pit_env()).learn(400, log_interval=None)
     assert 0 < half.curriculum.n_stuck < whole.curriculum.n_stuck
     half.save(tmp_path / "agent.zip")
     half.save_replay_buffer(tmp_path / "replay.zip")
     resumed = SkillGraphAgent.load(tmp_path / "agent.zip", env=half.get_env())
     resumed.load_replay_buffer(tmp_path / "replay.zip")
-    resumed.learn(600, reset_num_timesteps=False, log_interval=None)
+    resumed.learn(400, reset_num_timesteps=False, log_interval=None)
     assert differences(without_clock(state_of(resumed)), without_clock(state_of(whole))) == []
 
 

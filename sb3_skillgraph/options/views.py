@@ -38,7 +38,8 @@ def body_view(observation: np.ndarray, achieved_goal: np.ndarray, goal: np.ndarr
 
     Neither position nor heading is seen, and velocity and goal are turned by the heading: what has been learned in one
     place and direction holds in all. The observation must be what such a robot's positions and velocities are without x
-    and y: height, quaternion, n joint angles, 3 velocities, 3 angular velocities, n joint velocities.
+    and y: height, quaternion, n joint angles, 3 velocities, 3 angular velocities, n joint velocities (for
+    gymnasium-robotics' ant: made with ``include_cfrc_ext_in_observation=False``).
 
     :param observation: shape ``(m, 11 + 2 * n)``
     :param achieved_goal: shape ``(m, 2)``
