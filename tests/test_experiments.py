@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import Any
 
@@ -136,6 +137,40 @@ def test_an_error_is_kept_and_the_run_tried_again(tmp_path: Path) -> None:
     assert status([broken], tmp_path)[0].state == "failed"
     assert run(spec(), tmp_path) == "failed"
     assert "another configuration" in (broken.folder(tmp_path) / "error.txt").read_text()
+
+
+def test_what_is_done_is_not_taken_for_something_else(tmp_path: Path) -> None:
+    assert run(spec("random_walk"), tmp_path) == "done"
+    other = spec("random_walk", final_pairs=9)
+    assert run(other, tmp_path) == "failed"
+    assert "another configuration" in (other.folder(tmp_path) / "error.txt").read_text()
+    assert status([spec("random_walk")], tmp_path)[0].state == "done"
+
+
+def die_once(spec: RunSpec, out: Path) -> str:
+    """Stands in for a run whose worker is killed the first time."""
+    folder = spec.folder(out)
+    folder.mkdir(parents=True, exist_ok=True)
+    if spec.seed == 1 and not (folder / "died").exists():
+        (folder / "died").write_text("")
+        os.kill(os.getpid(), signal.SIGKILL)
+    (folder / "done.json").write_text("{}")
+    return "done"
+
+
+def die(spec: RunSpec, out: Path) -> str:
+    """Stands in for a run that always ends its worker."""
+    os.kill(os.getpid(), signal.SIGKILL)
+    return "done"
+
+
+def test_a_killed_worker_does_not_end_the_others_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    specs = [spec(seed=seed) for seed in range(4)]
+    monkeypatch.setattr(runner, "run", die_once)
+    assert compare(specs, tmp_path, n_jobs=2) == ["done"] * 4
+    monkeypatch.setattr(runner, "run", die)
+    with pytest.raises(BrokenProcessPool):  # but one that nothing survives
+        compare(specs, tmp_path, n_jobs=2)
 
 
 def test_a_run_that_another_worker_does_is_left_to_it(tmp_path: Path) -> None:
@@ -288,7 +323,9 @@ def test_curves_are_the_seeds_rows(runs: tuple[Path, Path]) -> None:
     assert list(curves) == ["frontier", "dco", "walk"]
     rows = read_progress(specs[0].folder(runs[1]))
     assert curves["frontier"].steps.tolist() == [400, 800, 1200, 1600]
-    assert curves["frontier"].mean.tolist() == pytest.approx([float(row["eval/success_rate"]) for row in rows])
+    same = [pair["success"] for pair in json.loads((specs[0].folder(runs[1]) / "done.json").read_text())["pairs"][:2]]
+    expected = [*(float(row["eval/success_rate"]) for row in rows[:-1]), np.mean(same)]
+    assert curves["frontier"].mean.tolist() == pytest.approx(expected)
     assert curves["walk"].steps.tolist() == [0, 1600]
     tested = practice_curves(specs, runs[1])
     assert list(tested) == ["frontier", "dco", "walk"]

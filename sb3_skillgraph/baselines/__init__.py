@@ -1,8 +1,8 @@
 """What the agent is compared with (sections 4.1, 4.2.1, A.5)."""
 
 from sb3_skillgraph.baselines.covering_options import CoveringOptions
-from sb3_skillgraph.baselines.goal_conditioned import GoalSchedule, make_her, make_uvfa
+from sb3_skillgraph.baselines.goal_conditioned import GoalSchedule, OptionTask, make_her, make_uvfa
 from sb3_skillgraph.baselines.random_walk import RandomWalk
-from sb3_skillgraph.baselines.recipe import OptionTask, make_recipe
+from sb3_skillgraph.baselines.recipe import make_recipe
 
 __all__ = ["CoveringOptions", "GoalSchedule", "OptionTask", "RandomWalk", "make_her", "make_recipe", "make_uvfa"]

@@ -89,13 +89,16 @@ class CoveringReplay(OptionReplay):
         here, there = data["achieved_goal"], data["next_achieved_goal"]
         goal = np.tile(self.end.center.astype(np.float32), (batch_size, 1))
         before, after = self.end.values(here), self.end.values(there)
-        done = (after <= self.end.threshold) | self.store.terminated(rows)
+        there_already, stuck = np.zeros(batch_size, dtype=bool), self.store.stuck(rows)
+        # Where the task's own goal ended an episode an option would have gone on.
+        done = (after <= self.end.threshold) | stuck
+        pay = self.rule.reward(there_already, done, stuck, here, there, goal) + (before - after) / self.scale
         return ReplayBufferSamples(
             observations=self._tensor(self.view(data["observation"], here, goal)),
             actions=self._tensor(data["action"]),
             next_observations=self._tensor(self.view(data["next_observation"], there, goal)),
             dones=self._tensor(done.astype(np.float32)[:, None]),
-            rewards=self._tensor(((before - after) / self.scale - 1.0).astype(np.float32)[:, None]),
+            rewards=self._tensor(pay.astype(np.float32)[:, None]),
         )
 
 
@@ -104,8 +107,9 @@ class CoveringOptions:
     The paper's hierarchical baseline: a fixed number of covering options and primitive actions, chosen among by SMDP
     Q-learning for a goal that is given (section 4, A.5).
 
-    Every 30 episodes (more often if there are fewer) an embedding of all experience is learned, and an option to one of
-    its two ends, in turns, by DDPG on all experience; from then on it is among the actions of Q-learning.
+    Every 30 episodes (more often if there are fewer, so that half of the steps are left when all options are there) an
+    option is learned by DDPG on all experience, in turns to the one and to the other end of an embedding of all
+    experience, a new one for every pair; from then on it is among the actions of Q-learning.
 
     :param env: a goal environment whose episodes end, and are paid, at the goal
     :param n_options: number of options; the paper tries 3, 4, 5 and 10
@@ -162,7 +166,7 @@ class CoveringOptions:
             OptionDDPG, kwargs, self.store, view, env.action_space, radius, radius, self.rng, {}, th.device("cpu")
         )
         self.env = OptionsEnv(
-            _Recorder(GoalSchedule(env, goal_freq), self), self.options, max_options=n_options + 8, gamma=gamma, view=view
+            _Recorder(GoalSchedule(env, goal_freq), self), self.options, max_options=n_options + 8, gamma=gamma
         )
         self.model = _QLearning(
             "MultiInputPolicy",
@@ -173,7 +177,7 @@ class CoveringOptions:
             gamma=gamma,
             train_freq=1,
             target_update_interval=500,
-            exploration_fraction=0.5,
+            exploration_fraction=0.75,
             exploration_final_eps=0.1,
             policy_kwargs={"net_arch": [128, 128]},
             seed=seed,
@@ -193,7 +197,7 @@ class CoveringOptions:
         """
         self._on_step = on_step
         episodes = total_timesteps // int(self.env.get_wrapper_attr("max_steps"))
-        self._next_option = self.option_freq = max(1, min(self.option_freq, episodes // (self.n_options + 1)))
+        self._next_option = self.option_freq = max(1, min(self.option_freq, episodes // (2 * self.n_options)))
         self.model.budget.start, self.model.budget.total = self.num_timesteps, total_timesteps
         self.model.learn(total_timesteps, self.model.budget, log_interval=1_000_000, reset_num_timesteps=False)
         return self
@@ -255,9 +259,14 @@ class CoveringOptions:
             self._on_step(self.num_timesteps)
 
     def _make_option(self) -> Option:
-        embedding = learn_fiedler(self.store, self.reach, 20_000, self.rng)
+        if len(self.options) % 2:
+            other = self.options[-1].termination
+            assert isinstance(other, LowEnd)
+            embedding, sign = other.embedding, -other.sign
+        else:
+            embedding, sign = learn_fiedler(self.store, self.reach, 20_000, self.rng), 1.0
         rows = self.rng.integers(self.store.oldest, self.store.total, 20_000)
-        end = LowEnd(embedding, 1.0 if len(self.options) % 2 == 0 else -1.0, self.store.column("achieved_goal", rows))
+        end = LowEnd(embedding, sign, self.store.column("achieved_goal", rows))
         before, after = (end.values(self.store.column(name, rows)) for name in ("achieved_goal", "next_achieved_goal"))
         scale = float(np.quantile(np.abs(before - after), 0.95)) or 1.0
         option = self._option(f"c{len(self.options)}", end, scale)
@@ -307,7 +316,8 @@ class _Recorder(gym.Wrapper):
         columns = {name: np.asarray(value).reshape(1, -1) for name, value in transition.items()}
         self._last = observation
         self.learner.after_step(columns, terminated, terminated or truncated)
-        return observation, reward, terminated, truncated, info
+        # Steps are environment steps: an option that runs when they are spent is cut off.
+        return observation, reward, terminated, truncated or self.learner.model.budget.share_left <= 0.0, info
 
 
 class _Budget(BaseCallback):

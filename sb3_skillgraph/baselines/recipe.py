@@ -1,4 +1,4 @@
-"""SB3's TD3 with HER on what the skill graph's own options are given: so that the recipe is not mistaken for the graph."""
+"""SB3's TD3 with HER on what an ant's options are given: so that the recipe is not mistaken for the graph."""
 
 from typing import Any
 
@@ -10,61 +10,9 @@ from stable_baselines3 import TD3, HerReplayBuffer
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 
+from sb3_skillgraph.baselines.goal_conditioned import OptionTask
 from sb3_skillgraph.options.option import goal_rule
 from sb3_skillgraph.options.views import VIEWS, ScaledView
-from sb3_skillgraph.replay import OptionRule
-
-
-class OptionTask(gym.Wrapper):
-    """
-    A goal environment that pays as options are paid: -1 a step, 0 at the goal, and for getting stuck, which ends the
-    episode, what standing there forever would.
-
-    :param env: a goal environment whose episodes end at the goal
-    :param rule: what is paid
-    """
-
-    def __init__(self, env: gym.Env, rule: OptionRule) -> None:
-        super().__init__(env)
-        self.rule = rule
-        self._last: dict[str, np.ndarray] = {}
-
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Begin an episode.
-
-        :param seed: seeds the wrapped environment
-        :param options: those of the wrapped environment
-        :return: observation and info
-        """
-        self._last, info = self.env.reset(seed=seed, options=options)
-        return self._last, info
-
-    def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Take a step.
-
-        :param action: action of the wrapped environment
-        :return: observation, reward, terminated, truncated, and info, which holds what hindsight must know
-        """
-        before = self._last["achieved_goal"]
-        self._last, _, terminated, truncated, info = self.env.step(action)
-        info = {**info, "before": before, "stuck": bool(info.get("stuck"))}
-        reward = float(self.compute_reward(self._last["achieved_goal"], self._last["desired_goal"], info))
-        return self._last, reward, terminated or info["stuck"], truncated, info
-
-    def compute_reward(self, achieved_goal: np.ndarray, desired_goal: np.ndarray, info: Any) -> np.ndarray:
-        """Return the reward of having come to a position when a goal was wanted; for relabelling.
-
-        :param achieved_goal: positions reached, shape ``(2,)`` or ``(n, 2)``
-        :param desired_goal: goals, same shape
-        :param info: what :meth:`step` returned, or an array of such
-        :return: shape ``()`` or ``(n,)``
-        """
-        after, goal = np.atleast_2d(achieved_goal), np.atleast_2d(desired_goal)
-        infos = [info] if isinstance(info, dict) else info
-        before, stuck = np.stack([each["before"] for each in infos]), np.array([each["stuck"] for each in infos])
-        reached = self.rule.reached(after, goal, np.ones(len(after), dtype=bool))
-        reward = self.rule.reward(reached, reached | stuck, stuck, before, after, goal)
-        return reward if np.ndim(achieved_goal) > 1 else reward[0]
 
 
 class ViewExtractor(BaseFeaturesExtractor):

@@ -66,6 +66,10 @@ def _finished(specs: Sequence[RunSpec], out: Path, salience: str | None = None) 
     return found
 
 
+def _name(spec: RunSpec) -> str:
+    return f"{spec.method}, seed {spec.seed}"
+
+
 def _agent(spec: RunSpec, out: Path) -> SkillGraphAgent:
     saved = checkpoints(spec.folder(out))
     if not saved:
@@ -104,7 +108,7 @@ def frontier(specs: Sequence[RunSpec], out: Path) -> Axes:
         points = draw.thinned(visits[:n_steps])
         values = embedding(points)
         ends = points[[values.argmin(), values.argmax()]]
-        draw.plot_frontier(axes, points, values, ends, geometry, f"{n_steps:,} steps")
+        draw.plot_frontier(axes, points, values, ends, geometry, f"{_name(spec)}, {n_steps:,} steps")
     return panels[0]
 
 
@@ -114,7 +118,7 @@ def exploration(specs: Sequence[RunSpec], out: Path) -> Axes:
     visits, geometry = _visits(_agent(spec, out)), _geometry(spec)
     walked = _random_walk(spec, len(visits))
     panels = draw.new_panels(6, n_rows=2)
-    for name, points, row in ((spec.method, visits, panels[:3]), ("random walk", walked, panels[3:])):
+    for name, points, row in ((_name(spec), visits, panels[:3]), ("random walk", walked, panels[3:])):
         for axes, share in zip(row, (0.1, 0.4, 1.0), strict=True):
             n_steps = int(share * len(points))
             draw.plot_visits(axes, points[:n_steps], geometry, f"{name}, {n_steps:,} steps")
@@ -146,35 +150,45 @@ def curves(specs: Sequence[RunSpec], out: Path) -> Axes:
     if not any(training):
         raise MissingRunError(f"There are no results in {out} yet.")
     testing = [practice_curves(here, out) for here in by_label]
+    methods = list(dict.fromkeys(spec.method for spec in specs))
     panels = draw.new_panels(len(labels) * (1 + any(testing)), n_rows=1 + any(testing))
     for axes, by_method, here, label in zip(panels, training, by_label, labels, strict=False):
-        draw.plot_curves(axes, by_method, f"{label} ({len({spec.seed for spec in here})} seeds)")
+        seeds = {spec.seed for spec in here if (spec.folder(out) / DONE).exists()}
+        draw.plot_curves(axes, by_method, methods, f"{label} ({len(seeds)} seeds)")
     if any(testing):
         for axes, by_method, label in zip(panels[len(labels) :], testing, labels, strict=True):
-            draw.plot_curves(axes, by_method, f"{label}, at test time", "environment steps with the goal")
-    panels[len(labels) - 1].legend(fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
+            draw.plot_curves(axes, by_method, methods, f"{label}, at test time", "environment steps with the goal")
+    shown = {name for by_method in training for name in by_method}
+    draw.add_legend(panels[len(labels) - 1], methods, shown)
     return panels[0]
 
 
 def method_curves(specs: Sequence[RunSpec], out: Path) -> dict[str, draw.Curve]:
     """Read the curves of every method on one environment; seeds that are not done yet are left out.
 
+    All points of a curve are of the same pairs: at the end, the first of the many that are tested then.
+
     :param specs: runs on that environment
     :param out: folder of all runs
     """
     result = {}
     for method in dict.fromkeys(spec.method for spec in specs):
-        folders = [spec.folder(out) for spec in specs if spec.method == method]
-        rows = [read_progress(folder) for folder in folders if (folder / DONE).exists()]
-        if not rows:
+        done = [spec for spec in specs if spec.method == method and (spec.folder(out) / DONE).exists()]
+        if not done:
             continue
-        steps = [int(row[STEPS]) for row in rows[0]]
-        scores = np.array([[float(row["eval/success_rate"]) for row in seed] for seed in rows])
+        steps = [int(row[STEPS]) for row in read_progress(done[0].folder(out))]
+        scores = np.array([_scores(spec, spec.folder(out)) for spec in done])
         if len(steps) == 1:  # nothing to learn: the same from the beginning
             steps, scores = [0, *steps], np.repeat(scores, 2, axis=1)
         estimates = np.array([estimate(column[None]) for column in scores.T])
         result[method] = draw.Curve(np.array(steps), *estimates.T)
     return result
+
+
+def _scores(spec: RunSpec, folder: Path) -> list[float]:
+    scores = [float(row["eval/success_rate"]) for row in read_progress(folder)]
+    pairs = json.loads((folder / DONE).read_text())["pairs"][: spec.pairs]
+    return [*scores[:-1], float(np.mean([pair["success"] for pair in pairs]))]
 
 
 def practice_curves(specs: Sequence[RunSpec], out: Path) -> dict[str, draw.Curve]:
@@ -209,7 +223,7 @@ def growth(specs: Sequence[RunSpec], out: Path) -> Axes:
     chosen = sorted({round(share * (len(snapshots) - 1)) for share in (0.0, 0.15, 0.4, 1.0)})
     panels = draw.new_panels(len(chosen))
     for axes, index in zip(panels, chosen, strict=True):
-        draw.plot_growth(axes, snapshots[index], geometry)
+        draw.plot_growth(axes, snapshots[index], geometry, _name(spec))
     return panels[0]
 
 
@@ -229,6 +243,7 @@ def _edge(specs: Sequence[RunSpec], out: Path, to_event: bool) -> Axes:
         if example is not None:
             panels = draw.new_panels(2)
             draw.plot_edge(panels, example, _geometry(spec))
+            panels[0].figure.suptitle(_name(spec))
             return panels[0]
     raise MissingRunError(f"No graph in {out} has an edge of that kind between two options.")
 
@@ -261,12 +276,14 @@ def clearest_edge(agent: SkillGraphAgent, to_event: bool) -> draw.EdgeExample | 
 def failure_of_dco(specs: Sequence[RunSpec], out: Path) -> Axes:
     """Figure 9: where deep covering options find no events, beside the agent with another salience."""
     panels = draw.new_panels(2)
-    for axes, salience in zip(panels, ("dco", "frontier"), strict=True):
-        spec = _finished(specs, out, salience)[0]
+    both = [_finished(specs, out, salience) for salience in ("dco", "frontier")]
+    seed = next((spec.seed for spec in both[0] if spec.seed in {other.seed for other in both[1]}), both[0][0].seed)
+    for axes, runs in zip(panels, both, strict=True):
+        spec = next((run for run in runs if run.seed == seed), runs[0])
         agent = _agent(spec, out)
         pairs = json.loads((spec.folder(out) / DONE).read_text())["pairs"]
         missed = np.array([pair["goal"] for pair in pairs if not pair["success"]]).reshape(-1, agent.graph.goal_dim)
         centers = np.array([event.center for event in agent.events])
-        title = f"{spec.method}: {len(centers)} events, {len(missed)} of {len(pairs)} goals missed"
+        title = f"{_name(spec)}: {len(centers)} events, {len(missed)} of {len(pairs)} goals missed"
         draw.plot_missed(axes, agent.visited.points, centers, missed, _geometry(spec), title)
     return panels[0]

@@ -147,7 +147,7 @@ class _Checks(BaseCallback):
 class GoalConditionedLearner(Learner):
     """SB3's DDPG (which is a TD3 to SB3) that is told the goal, with hindsight or without."""
 
-    make: Callable[..., Any]
+    make: Callable[..., TD3]
 
     def __init__(self, env_id: str, env_kwargs: dict[str, Any], seed: int, arguments: dict[str, Any]) -> None:
         env = gym.make(env_id, **{"terminate_on_success": True, **env_kwargs})
@@ -184,18 +184,18 @@ class UVFALearner(GoalConditionedLearner):
 class HERLearner(GoalConditionedLearner):
     """A new goal every episode, and in hindsight."""
 
-    make = staticmethod(make_her)
-
-
-class RecipeLearner(GoalConditionedLearner):
-    """TD3 with hindsight on what the skill graph's options are given."""
-
-    make = staticmethod(make_recipe)
+    make: Callable[..., TD3] = staticmethod(make_her)
 
     def practise(self, env: gym.Env, start: np.ndarray, goal: np.ndarray, stretches: list[int]) -> Iterator[Predictor]:
         """Let a copy go on learning, paid as before."""
         rule = self.policy.get_env().get_attr("rule")[0]  # type: ignore[union-attr]
         yield from super().practise(OptionTask(env, rule), start, goal, stretches)
+
+
+class RecipeLearner(HERLearner):
+    """TD3 with hindsight on what an ant's options are given."""
+
+    make = staticmethod(make_recipe)
 
 
 class CoveringOptionsLearner(Learner):

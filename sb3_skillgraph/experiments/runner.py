@@ -8,6 +8,7 @@ import shutil
 import time
 import traceback
 from collections.abc import Sequence
+from concurrent.futures.process import BrokenProcessPool
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -59,7 +60,25 @@ def compare(specs: Sequence[RunSpec], out: Path, n_jobs: int = 1, backend: str =
     if backend == "ray":
         _register_ray()
     with parallel_config(backend=backend, n_jobs=n_jobs):
-        return list(Parallel()(delayed(run)(spec, out) for spec in specs))
+        outcomes = _do(specs, out)
+        # Whoever was at work elsewhere may have been killed meanwhile.
+        left = [i for i, outcome in enumerate(outcomes) if outcome == "elsewhere"]
+        for i, outcome in zip(left, _do([specs[i] for i in left], out), strict=True):
+            outcomes[i] = "done" if outcome == "skipped" else outcome
+    return outcomes
+
+
+def _do(specs: Sequence[RunSpec], out: Path) -> list[Outcome]:
+    before = -1
+    while True:
+        n_done = sum((spec.folder(out) / DONE).exists() for spec in specs)
+        try:
+            return list(Parallel(batch_size=1, pre_dispatch="n_jobs")(delayed(run)(spec, out) for spec in specs))
+        except BrokenProcessPool:
+            # A worker was killed, and joblib has ended the others: go on, unless that is all that ever happens.
+            if n_done == before:
+                raise
+            before = n_done
 
 
 def _register_ray() -> None:
@@ -81,11 +100,13 @@ def run(spec: RunSpec, out: Path) -> Outcome:
     folder.mkdir(parents=True, exist_ok=True)
     try:
         # The lock falls with the process that holds it, however that ends.
-        with FileLock(folder / LOCK, timeout=0):
-            if (folder / DONE).exists():
-                return "skipped"
+        with FileLock(folder / LOCK, timeout=1):  # a look at its status takes the lock for a moment
             try:
-                _Run(spec, folder).do()
+                this = _Run(spec, folder)
+                this.check_config()
+                if (folder / DONE).exists():
+                    return "skipped"
+                this.do()
             except Exception:
                 write_atomically(folder / ERROR, traceback.format_exc())
                 return "failed"
@@ -105,7 +126,6 @@ class _Run:
 
     def do(self) -> None:
         spec, folder = self.spec, self.folder
-        self._check_config()
         (folder / ERROR).unlink(missing_ok=True)
         self.learner = ALGORITHMS[spec.algorithm](spec.env_id, spec.env_kwargs, spec.seed, spec.arguments)
         begin = self._resume(self.learner)
@@ -132,7 +152,7 @@ class _Run:
         }
         write_atomically(folder / DONE, json.dumps(document, indent=1) + "\n")
 
-    def _check_config(self) -> None:
+    def check_config(self) -> None:
         versions = {name: version(name) for name in _VERSIONS_OF}
         path, config = self.folder / CONFIG, json.loads(json.dumps(self.spec.as_plain()))
         if path.exists():
@@ -149,6 +169,8 @@ class _Run:
         if steps:
             learner.load(saved[steps])
         self.rows = [row for row in read_progress(self.folder) if int(row[STEPS]) <= steps]
+        if not self.rows:
+            (self.folder / PROGRESS).unlink(missing_ok=True)
         self.seconds = float(self.rows[-1][SECONDS]) if self.rows else 0.0
         return steps
 

@@ -1,12 +1,13 @@
 """The paper's figures from arrays: growth, exploration, learning curves, and how sets become edges."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from sb3_skillgraph.envs import MazeGeometry
@@ -112,28 +113,50 @@ def plot_visits(axes: Axes, points: np.ndarray, geometry: MazeGeometry | None, t
     axes.set_title(title)
 
 
-def plot_curves(axes: Axes, curves: Mapping[str, Curve], title: str, x_label: str = "environment steps") -> None:
+def plot_curves(
+    axes: Axes, curves: Mapping[str, Curve], methods: Sequence[str], title: str, x_label: str = "environment steps"
+) -> None:
     """Draw success against steps for several methods (Figure 5).
 
     :param axes: where to draw
     :param curves: by method
+    :param methods: all there are, on other panels, too: each has its colour
     :param title: of the panel
     :param x_label: what the steps are
     """
-    colours = colormaps["tab10"](range(10))
-    for (name, curve), colour in zip(curves.items(), colours, strict=False):
+    colours = _colours(methods)
+    for name, curve in curves.items():
+        colour = colours[name]
         axes.plot(curve.steps, curve.mean, label=name, color=colour, marker="o", markersize=3)
         axes.fill_between(curve.steps, curve.low, curve.high, color=colour, alpha=0.15, linewidth=0)
     axes.set(title=title, xlabel=x_label, ylabel="success rate (interquartile mean)", ylim=(-0.02, 1.02))
     axes.grid(alpha=0.3)
 
 
-def plot_growth(axes: Axes, snapshot: GraphSnapshot, geometry: MazeGeometry | None) -> None:
+def add_legend(axes: Axes, methods: Sequence[str], shown: Collection[str]) -> None:
+    """Name the curves, beside a panel.
+
+    :param axes: the panel
+    :param methods: all there are
+    :param shown: those that some panel has a curve of
+    """
+    colours = {name: colour for name, colour in _colours(methods).items() if name in shown}
+    handles = [Line2D([], [], color=colour, marker="o", markersize=3, label=name) for name, colour in colours.items()]
+    axes.legend(handles=handles, fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
+
+
+def _colours(methods: Sequence[str]) -> dict[str, tuple[float, float, float, float]]:
+    colours = colormaps["tab10" if len(methods) <= 10 else "tab20"]
+    return {name: colours(i % colours.N) for i, name in enumerate(methods)}
+
+
+def plot_growth(axes: Axes, snapshot: GraphSnapshot, geometry: MazeGeometry | None, name: str) -> None:
     """Draw events and what joins them at one moment (Figure 6).
 
     :param axes: where to draw
     :param snapshot: the graph then
     :param geometry: the maze
+    :param name: of the run
     """
     figures.draw_floor(axes, geometry, snapshot.centers, 1.0)
     centers = figures.project(snapshot.centers)
@@ -141,7 +164,7 @@ def plot_growth(axes: Axes, snapshot: GraphSnapshot, geometry: MazeGeometry | No
         axes.plot(*centers[[source, target]].T, color="#3182bd", linewidth=1.0, zorder=figures.Z_LINK)
     axes.plot(*centers.T, "o", color=figures.EVENT, markersize=5, zorder=figures.Z_EVENT)
     n_joined = len({frozenset(link) for link in snapshot.links})
-    axes.set_title(f"{snapshot.steps:,} steps: {len(centers)} events, {n_joined} joined pairs")
+    axes.set_title(f"{name}, {snapshot.steps:,} steps:\n{len(centers)} events, {n_joined} joined pairs")
 
 
 def plot_edge(axes: Sequence[Axes], example: EdgeExample, geometry: MazeGeometry | None) -> None:
