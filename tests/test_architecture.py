@@ -33,8 +33,9 @@ FLOORS: dict[str, float] = {
     "controller": 4,
     "smdp": 4,
     "curriculum": 4.2,  # turns the controller's outcomes into knowledge
-    "persistence": 4.5,  # these two are the agent's lower storeys
+    "persistence": 4.5,  # these three are the agent's lower storeys
     "assembly": 4.7,
+    "rollouts": 4.8,
     "agent": 5,
     "evaluation": 6,
     "callbacks": 6,
