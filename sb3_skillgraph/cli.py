@@ -20,7 +20,7 @@ import sb3_skillgraph.envs  # noqa: F401 - registers the environments
 from sb3_skillgraph.agent import SkillGraphAgent
 from sb3_skillgraph.baselines import RandomWalk
 from sb3_skillgraph.callbacks import SkillGraphProgressBarCallback
-from sb3_skillgraph.console import UserError, assignment, for_people, positive
+from sb3_skillgraph.console import UserError, assignment, for_people, positive, versions
 from sb3_skillgraph.evaluation import PairsResult, evaluate_pairs
 from sb3_skillgraph.experiments.commands import add_compare, add_figure, add_status
 from sb3_skillgraph.hyperparams import check_hyperparams, did_you_mean, load_hyperparams
@@ -28,7 +28,6 @@ from sb3_skillgraph.plotting import plot_plan, plot_skill_graph, run_plan, save_
 
 DEMO_ENV, DEMO_STEPS, DEMO_PAIRS = "SkillGraph/PointMazeMedium-v0", 100_000, 100
 USER_ERROR, INTERRUPTED = 2, 130
-_VERSIONS_OF = ("sb3_skillgraph", "stable_baselines3", "torch", "gymnasium", "gymnasium_robotics", "mujoco", "numpy")
 
 
 class _Parser(argparse.ArgumentParser):
@@ -195,7 +194,7 @@ def _learn(
             agent = SkillGraphAgent(env=env, seed=seed, **{"device": device, **arguments})
         out.mkdir(parents=True, exist_ok=True)
         config = dict(env=env_id, env_kwargs=env_kwargs, steps=steps, seed=seed, n_envs=n_envs, arguments=arguments)
-        _write_json(out / "config.json", {**config, "versions": {name: version(name) for name in _VERSIONS_OF}})
+        _write_json(out / "config.json", {**config, "versions": versions()})
         agent.set_logger(configure(str(out), ["csv", "stdout"] if verbose else ["csv"]))
         bar = SkillGraphProgressBarCallback()
         try:

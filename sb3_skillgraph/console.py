@@ -1,12 +1,15 @@
-"""What all commands share: errors for people, and arguments in YAML."""
+"""What all commands share: errors for people, arguments in YAML, and the versions in use."""
 
 import argparse
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib.metadata import version
 from typing import Any
 
 import gymnasium as gym
 import yaml
+
+_VERSIONS_OF = ("sb3_skillgraph", "stable_baselines3", "torch", "gymnasium", "gymnasium_robotics", "mujoco", "numpy")
 
 
 class UserError(Exception):
@@ -20,6 +23,11 @@ def for_people() -> Iterator[None]:
         yield
     except (ValueError, TypeError, RuntimeError, gym.error.Error) as error:
         raise UserError(str(error)) from error
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of everything that a run's results may depend on."""
+    return {name: version(name) for name in _VERSIONS_OF}
 
 
 def positive(text: str) -> int:

@@ -7,7 +7,7 @@ import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
-from sb3_skillgraph.options.views import VIEWS, View
+from sb3_skillgraph.options.views import View, as_view
 
 FLOAT32_MAX = float(np.finfo(np.float32).max)
 KEYS = ("observation", "achieved_goal", "desired_goal")
@@ -163,11 +163,7 @@ def find_view(view: str | View | None, env: VecEnv | None) -> tuple[str | None, 
     """
     if view is None:
         view = (env_attribute(env, "option_view") if env is not None else None) or "relative"
-    if callable(view):
-        return None, view
-    if view not in VIEWS:
-        raise ValueError(f"Unknown option_view {view!r}: use one of {sorted(VIEWS)} or a function.")
-    return view, VIEWS[view]
+    return (None if callable(view) else view), as_view(view)
 
 
 class Oracle:

@@ -191,8 +191,6 @@ class Persistence(OffPolicyAlgorithm):
         :raises ValueError: if the file is damaged or holds something else, or does not fit this agent
         """
         tree = load_tree(path, "replay_buffer")
-        if "stuck" not in tree["store"]:
-            raise ValueError("The replay buffer was saved by an older version, which did not know of agents that get stuck.")
         self.store.set_state(tree["store"])
         for option in self.options:
             if option.id in tree["rows"]:

@@ -158,6 +158,8 @@ class TransitionStore:
 
         :raises ValueError: if the stored rows do not fit this store
         """
+        if "stuck" not in state:
+            raise ValueError("The replay buffer was saved by an older version, which did not know of agents that get stuck.")
         for name in ("n_envs", "capacity"):
             if state[name] != getattr(self, name):
                 raise ValueError(

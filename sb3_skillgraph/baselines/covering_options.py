@@ -19,7 +19,7 @@ from sb3_skillgraph.options.factory import OptionFactory, copy_policy
 from sb3_skillgraph.options.initiation import InitiationSet
 from sb3_skillgraph.options.learner import OptionDDPG
 from sb3_skillgraph.options.option import Option
-from sb3_skillgraph.options.views import VIEWS, ScaledView
+from sb3_skillgraph.options.views import ScaledView, as_view
 from sb3_skillgraph.replay import OptionReplay, TransitionStore
 from sb3_skillgraph.salience.dco import FiedlerEmbedding, learn_fiedler
 from sb3_skillgraph.smdp import FlatPolicy, OptionsEnv, SMDPQLearning
@@ -154,7 +154,7 @@ class CoveringOptions:
         spec = GoalSpec.of(env.observation_space, env.action_space)
         self.store = TransitionStore(1_000_000, spec.observation_dim, spec.goal_dim, spec.action_dim)
         radius = float(env.get_wrapper_attr("success_radius"))
-        view = ScaledView(VIEWS[env.get_wrapper_attr("option_view")], radius)
+        view = ScaledView(as_view(env.get_wrapper_attr("option_view")), radius)
         kwargs = dict(
             gamma=gamma,
             actor_learning_rate=1e-3,

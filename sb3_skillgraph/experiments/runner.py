@@ -9,7 +9,6 @@ import time
 import traceback
 from collections.abc import Sequence
 from concurrent.futures.process import BrokenProcessPool
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -19,6 +18,7 @@ import torch as th
 from filelock import FileLock, Timeout
 from joblib import Parallel, delayed, parallel_config
 
+from sb3_skillgraph.console import versions
 from sb3_skillgraph.evaluation import PairsResult, evaluate_pairs, run_pair
 from sb3_skillgraph.experiments.learners import ALGORITHMS, Learner
 from sb3_skillgraph.experiments.plan import RunSpec
@@ -27,7 +27,6 @@ CONFIG, PROGRESS, DONE, ERROR, LOCK = "config.json", "progress.csv", "done.json"
 STEPS, SECONDS = "time/total_timesteps", "time/seconds"
 STRETCH = 1_000  # environment steps between tests at test time: an episode
 Outcome = Literal["done", "skipped", "elsewhere", "failed"]
-_VERSIONS_OF = ("sb3_skillgraph", "stable_baselines3", "torch", "gymnasium", "gymnasium_robotics", "mujoco", "numpy")
 
 
 class RunStatus(NamedTuple):
@@ -153,14 +152,13 @@ class _Run:
         write_atomically(folder / DONE, json.dumps(document, indent=1) + "\n")
 
     def check_config(self) -> None:
-        versions = {name: version(name) for name in _VERSIONS_OF}
         path, config = self.folder / CONFIG, json.loads(json.dumps(self.spec.as_plain()))
         if path.exists():
             before = {name: value for name, value in json.loads(path.read_text()).items() if name != "versions"}
             if before != config:
                 raise ValueError(f"{self.folder} holds a run with another configuration: remove it, or choose another folder.")
         else:
-            write_atomically(path, json.dumps({**config, "versions": versions}, indent=1) + "\n")
+            write_atomically(path, json.dumps({**config, "versions": versions()}, indent=1) + "\n")
 
     def _resume(self, learner: Learner) -> int:
         """Load the newest checkpoint and drop what was written after it; return the steps done."""

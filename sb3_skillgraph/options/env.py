@@ -10,7 +10,7 @@ from sb3_skillgraph.events import SalientEvent
 from sb3_skillgraph.options.execution import Fate, fate
 from sb3_skillgraph.options.initiation import InitiationSet
 from sb3_skillgraph.options.option import Option, termination_rule
-from sb3_skillgraph.options.views import VIEWS, ScaledView
+from sb3_skillgraph.options.views import ScaledView, as_view
 
 
 class OptionEnv(gym.Wrapper):
@@ -54,8 +54,8 @@ class OptionEnv(gym.Wrapper):
         self.goal = np.asarray(goal, dtype=np.float32)
         if self.goal.shape != space["achieved_goal"].shape:
             raise ValueError(f"The goal must have shape {space['achieved_goal'].shape}, not {self.goal.shape}.")
-        view = (env.get_wrapper_attr("option_view") if env.has_wrapper_attr("option_view") else None) or "relative"
-        self.view = ScaledView(view if callable(view) else VIEWS[view], termination.radius)
+        view = env.get_wrapper_attr("option_view") if env.has_wrapper_attr("option_view") else None
+        self.view = ScaledView(as_view(view), termination.radius)
         self.rule = termination_rule(termination, termination.radius)
         dims = [int(np.prod(space[key].shape)) for key in ("observation", "achieved_goal")]  # type: ignore[arg-type]
         self.observation_space = spaces.Box(-np.inf, np.inf, (self.view.dim(*dims),), np.float32)

@@ -77,6 +77,20 @@ def _turned(vectors: np.ndarray, heading: np.ndarray) -> np.ndarray:
 VIEWS: dict[str, View] = {"relative": relative_view, "egocentric": egocentric_view, "body": body_view}
 
 
+def as_view(view: str | View | None) -> View:
+    """Return the view that an environment or an argument names.
+
+    :param view: name, function, or None for ``"relative"``
+    :raises ValueError: if there is no view of that name
+    """
+    if callable(view):
+        return view
+    name = "relative" if view is None else view
+    if name not in VIEWS:
+        raise ValueError(f"Unknown option_view {name!r}: use one of {sorted(VIEWS)} or a function.")
+    return VIEWS[name]
+
+
 class ScaledView:
     """A view whose goal space is measured in event radii, so that networks see numbers of order one.
 
