@@ -193,6 +193,14 @@ def test_on_loky(tmp_path: Path) -> None:
     assert {s.state for s in status(specs, tmp_path / "runs")} == {"done"}
 
 
+def test_an_environment_may_be_tested_otherwise(tmp_path: Path) -> None:
+    environments = {"toy": {"id": TOY, "steps": 400}, "long": {"id": TOY, "steps": 800, "check_every": 400, "test_pairs": 1}}
+    specs = load_plan(plan(tmp_path / "plan.yml", environments=environments, seeds=[0]))
+    toy, long = specs[0], specs[2]
+    assert (toy.check_every, toy.test_pairs, toy.pairs) == (200, 0, 2)
+    assert (long.check_every, long.test_pairs, long.pairs) == (400, 1, 2)
+
+
 def test_on_ray(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ray = pytest.importorskip("ray")
     monkeypatch.setenv("RAY_worker_niceness", "0")  # lest its workers starve beside the other tests

@@ -13,7 +13,7 @@ from sb3_skillgraph.hyperparams import check_hyperparams, did_you_mean
 _COMMON = ("check_every", "pairs", "final_pairs", "test_pairs", "test_stretches")
 _TOP = {"methods": dict, "environments": dict, "seeds": list, **dict.fromkeys(_COMMON, int)}
 _METHOD = {"algorithm": str, "arguments": dict}
-_ENVIRONMENT = {"id": str, "kwargs": dict, "steps": int, "seeds": list, "methods": list}
+_ENVIRONMENT = {"id": str, "kwargs": dict, "steps": int, "seeds": list, "methods": list, **dict.fromkeys(_COMMON, int)}
 
 
 @dataclass(frozen=True)
@@ -62,8 +62,8 @@ def load_plan(path: Path) -> list[RunSpec]:
     """Read a plan.
 
     :param path: YAML file: ``methods`` (name -> ``algorithm``, ``arguments``), ``environments`` (name -> ``id``,
-        ``kwargs``, ``steps``, and ``seeds`` or ``methods`` where not all are wanted), ``seeds``, ``check_every``,
-        ``pairs``, ``final_pairs``, ``test_pairs``, ``test_stretches``
+        ``kwargs``, ``steps``, and ``seeds`` or ``methods`` where not all are wanted), ``seeds``, and ``check_every``,
+        ``pairs``, ``final_pairs``, ``test_pairs``, ``test_stretches`` for all environments or for one
     :return: one spec for each run, seed by seed, so that the first results compare all methods
     :raises ValueError: if the file says anything else, or too little
     """
@@ -86,7 +86,6 @@ def load_plan(path: Path) -> list[RunSpec]:
         str(name): _checked(value, _ENVIRONMENT, f"{path}, environment {name!r}", required=("id", "steps"))
         for name, value in top["environments"].items()
     }
-    common = {name: top[name] for name in _COMMON if name in top}
     specs = []
     for label, env in environments.items():
         unknown = [name for name in env.get("methods", ()) if name not in methods]
@@ -104,7 +103,7 @@ def load_plan(path: Path) -> list[RunSpec]:
                 env["steps"],
                 arguments=methods[name].get("arguments", {}),
                 env_kwargs=env.get("kwargs", {}),
-                **common,
+                **{name: given[name] for given in (top, env) for name in _COMMON if name in given},
             )
             for seed in env.get("seeds", top["seeds"])
             for name in env.get("methods", methods)
