@@ -92,6 +92,8 @@ class SkillGraphAgent(Rollouts):
         ``"uniform"`` (any event [3.2.2])
     :param explore_prob: probability that a mission explores: to the event nearest to a random point, and beyond
     :param exploration_steps: environment steps of such an exploration
+    :param explore_beyond: event radii that an exploration towards a random point goes on past it; half of the explorations
+        are random walks instead
     :param practise_prob: probability that a mission goes to an event that a path leads to
     :param practise: which one: ``"least_tried"`` (whose last step on the path has run least often) or ``"random"``
     :param max_tries: timed-out options after which a mission is given up
@@ -165,6 +167,7 @@ class SkillGraphAgent(Rollouts):
         target_choice: Literal["nearest", "uniform"] = "nearest",
         explore_prob: float = 0.2,
         exploration_steps: int = 100,
+        explore_beyond: float = 0.0,
         practise_prob: float = 0.2,
         practise: Literal["least_tried", "random"] = "least_tried",
         max_tries: int = 3,

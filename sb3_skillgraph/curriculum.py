@@ -27,6 +27,7 @@ class Strategy(NamedTuple):
     practise: Literal["least_tried", "random"]
     explore_prob: float
     exploration_steps: int
+    explore_beyond: float
     max_tries: int
     link_reach: int
     off_policy_runs: bool
@@ -372,7 +373,7 @@ class Curriculum:
         return Mission(self.graph.events["e0"].center, explore_steps=self.strategy.exploration_steps, exploring=True)
 
     def _explore(self, towards: np.ndarray | None = None) -> Mission:
-        """Return to where the agent has rarely been, and go on from there: at random, or towards a random point.
+        """Return to where the agent has rarely been, and go on from there: at random, or past a random point.
 
         Of some visited states, drawn as an RRT draws them (section 2.4: those nearest to uniform random points), it is
         the one with the fewest visits around it.
@@ -388,8 +389,11 @@ class Curriculum:
         samples = self.rng.uniform(lower, upper, (N_EXPLORED, points.shape[1]))
         nearest = [points[self.visited.near(sample, 0.0)[0]] for sample in samples]
         rarest = int(np.argmin([len(self.visited.near(point, radius)) for point in nearest]))
-        beyond = samples[rarest] if self.rng.random() < 0.5 else None
-        return Mission(nearest[rarest].astype(np.float64), explore_steps=steps, beyond=beyond)
+        goal, beyond = nearest[rarest].astype(np.float64), None
+        if self.rng.random() < 0.5:
+            way = samples[rarest] - goal
+            beyond = samples[rarest] + self.strategy.explore_beyond * radius * way / max(float(np.linalg.norm(way)), 1e-9)
+        return Mission(goal, explore_steps=steps, beyond=beyond)
 
     # -- saving -------------------------------------------------------------------------------------------------------
 

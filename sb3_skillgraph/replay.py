@@ -10,6 +10,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
+DOOMED_STEPS = 50  # before the agent got stuck, in which no goal is put in by hindsight
 _COLUMNS = ("observation", "achieved_goal", "next_observation", "next_achieved_goal", "action", "goal")
 
 
@@ -119,6 +120,15 @@ class TransitionStore:
     def stuck(self, rows: np.ndarray) -> np.ndarray:
         """Tell after which rows the agent was stuck, shape ``(len(rows),)``."""
         return self._stuck[rows % self.capacity]
+
+    def doomed(self, rows: np.ndarray, within: int) -> np.ndarray:
+        """Tell which rows lie at most so many steps before the agent got stuck, shape ``(len(rows),)``.
+
+        :param rows: row numbers
+        :param within: number of steps
+        """
+        last = self._last_row[self._trajectory[rows % self.capacity]]
+        return self.stuck(last) & ((last - rows) // self.n_envs < within)
 
     def cut(self) -> None:
         """End every running trajectory: what is written next does not follow from what was written last."""
@@ -234,9 +244,9 @@ class OptionReplay(ReplayBuffer):
     """What one option learns from: rows of the shared store, seen with the option's goal, reward and end.
 
     It holds row numbers only. Each sampled transition keeps the goal that was pursued, or, with probability
-    ``hindsight``, takes a goal that its trajectory achieved later (Andrychowicz et al., 2017); reward and end are
-    recomputed by the option's rule. A share of every batch may come from the whole store, always in hindsight, so that
-    an option that copied the global one does not unlearn what it copied.
+    ``hindsight``, takes a goal that its trajectory achieved later (Andrychowicz et al., 2017), unless the agent got stuck
+    soon after; reward and end are recomputed by the option's rule. A share of every batch may come from the whole store,
+    in hindsight as often as possible, so that an option that copied the global one does not unlearn what it copied.
 
     :param store: the shared memory
     :param view: what a policy sees: ``(observation, achieved_goal, goal) -> (n, dim)``
@@ -315,6 +325,7 @@ class OptionReplay(ReplayBuffer):
         """
         rng, store = self.rng, self.store
         if self.everything:
+            n_own = batch_size
             rows = rng.integers(store.oldest, store.total, size=batch_size)
             imagined = rng.random(batch_size) < self.hindsight
         else:
@@ -326,8 +337,12 @@ class OptionReplay(ReplayBuffer):
             imagined[:n_own] = rng.random(n_own) < self.hindsight
         data = store.read(rows)
         goal, next_achieved_goal = data["goal"], data["next_achieved_goal"]
-        later = store.future(rows[imagined], self.horizon, rng)
-        goal[imagined] = store.column("next_achieved_goal", later)
+        # What was achieved on the way to getting stuck would make that way look safe: it all came before.
+        doomed = store.doomed(rows, DOOMED_STEPS)
+        imagined[:n_own] &= ~doomed[:n_own]
+        relabelled = imagined & ~doomed
+        later = store.future(rows[relabelled], self.horizon, rng)
+        goal[relabelled] = store.column("next_achieved_goal", later)
         reached, stuck = self.rule.reached(next_achieved_goal, goal, imagined), store.stuck(rows)
         over = reached | stuck | store.terminated(rows)
         rewards = self.rule.reward(reached, over, stuck, data["achieved_goal"], next_achieved_goal, goal)

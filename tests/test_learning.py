@@ -47,6 +47,28 @@ def test_reaches_goals_it_never_trained_on() -> None:
     assert summary["joined_pairs"] > 0.3
 
 
+@pytest.mark.parametrize("explore_beyond", [0.0, 5.0])
+def test_explorations_go_past_a_random_point(explore_beyond: float) -> None:
+    agent = new_agent(explore_prob=1.0, explore_beyond=explore_beyond)
+    walks, past = 0, []
+
+    def note(*_: Any) -> bool:
+        nonlocal walks
+        for mission in agent.curriculum.missions:
+            if mission.beyond is None:
+                walks += 1
+            else:
+                past.append(float(np.linalg.norm(mission.beyond - mission.goal)))
+        return True
+
+    agent.learn(1000, callback=note)
+    reach = explore_beyond * agent.graph.events["e0"].radius
+    assert walks
+    assert min(past) >= reach
+    assert len(set(past)) > 3
+    assert min(past) < reach + 1.0
+
+
 def test_finds_a_way_to_a_region_that_training_never_reached() -> None:
     """A door opens after training: adaptation looks for a way to the goal behind it, and old goals stay reachable."""
     shut: MazeMap = [[1] * 7, [1, "r", 0, 1, 0, 0, 1], [1, 0, 0, 1, 0, 0, 1], [1] * 7]

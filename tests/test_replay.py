@@ -15,7 +15,7 @@ from sb3_skillgraph.events import SalientEvent
 from sb3_skillgraph.options.env import OptionEnv
 from sb3_skillgraph.options.option import goal_rule, termination_rule
 from sb3_skillgraph.options.views import ScaledView, relative_view
-from sb3_skillgraph.replay import OptionReplay, OptionRule, TransitionStore
+from sb3_skillgraph.replay import DOOMED_STEPS, OptionReplay, OptionRule, TransitionStore
 
 CAPACITY = 12
 #: One step of all environments: who is done, and whether the store is cut afterwards.
@@ -173,7 +173,9 @@ class SpyStore(TransitionStore):
         return super().column(name, rows)
 
 
-def walked_store(capacity: int = 400, n_steps: int = 60, n_envs: int = 2, seed: int = 0) -> TransitionStore:
+def walked_store(
+    capacity: int = 400, n_steps: int = 60, n_envs: int = 2, seed: int = 0, gets_stuck: bool = True
+) -> TransitionStore:
     """Random walks; the action tells the row, the pursued goal is one that nothing ever achieves."""
     rng = np.random.default_rng(seed)
     store = SpyStore(capacity, OBSERVATION_DIM, 2, 1, n_envs)
@@ -182,7 +184,7 @@ def walked_store(capacity: int = 400, n_steps: int = 60, n_envs: int = 2, seed: 
         following = point + rng.normal(0.3, 1.5, point.shape)
         done = rng.random(n_envs) < 0.1
         number = np.arange(store.total, store.total + n_envs, dtype=np.float32)[:, None]
-        terminated, stuck = done & (t % 3 > 0), done & (t % 3 == 2)
+        terminated, stuck = done & (t % 3 > 0), done & (t % 3 == 2) & gets_stuck
         store.add(number, point, number, following, number, np.full((n_envs, 2), 1e4), terminated, done, stuck)
         point = np.where(done[:, None], 0.0, following)
     return store
@@ -201,10 +203,11 @@ def make_replay(store: TransitionStore, rule: OptionRule, **kwargs: Any) -> Opti
     )
 
 
-def check_relabelling(store: TransitionStore, samples: ReplayBufferSamples, *, ends_in_event: bool) -> np.ndarray:
+def check_relabelling(store: TransitionStore, samples: ReplayBufferSamples, *, n_ending_in_event: int) -> np.ndarray:
     """Recompute every sampled transition by hand.
 
-    :return: which of them were imagined
+    :param n_ending_in_event: how many, the first ones, end in the event unless their goal was imagined
+    :return: which of those that do not soon get stuck were imagined
     """
     seen, following = samples.observations.numpy(), samples.next_observations.numpy()
     rows = samples.actions.numpy()[:, 0].astype(int)
@@ -216,7 +219,7 @@ def check_relabelling(store: TransitionStore, samples: ReplayBufferSamples, *, e
         np.testing.assert_array_equal(seen[i, :-2], np.r_[row, store.column("achieved_goal", number)[0]])
         end = store.column("next_achieved_goal", number)[0]
         np.testing.assert_array_equal(following[i, :-2], np.r_[row, end])
-        if imagined[i] or not ends_in_event:
+        if imagined[i] or i >= n_ending_in_event:
             reached = np.linalg.norm(end - goals[i]) <= RADIUS
         else:
             reached = np.linalg.norm(end - EVENT.center) <= EVENT.radius
@@ -225,7 +228,21 @@ def check_relabelling(store: TransitionStore, samples: ReplayBufferSamples, *, e
         assert samples.dones[i, 0] == float(reached or stuck or store.terminated(number)[0])
     achieved = {tuple(point) for point in store.column("next_achieved_goal", np.arange(store.oldest, store.total))}
     assert {tuple(goal) for goal in goals[imagined]} <= achieved
-    return imagined
+    doomed = np.isin(rows, soon_stuck(store))
+    assert not imagined[doomed].any()
+    return imagined[~doomed]
+
+
+def soon_stuck(store: TransitionStore) -> list[int]:
+    """Rows from which the agent gets stuck within ``DOOMED_STEPS`` steps, found by walking on from each."""
+    found = []
+    ends = store.get_state()["last_row"]
+    trajectory = store.get_state()["trajectory"]
+    for row in range(store.oldest, store.total):
+        end = int(ends[trajectory[row - store.oldest]])
+        if store.stuck(np.array([end]))[0] and end < row + DOOMED_STEPS * store.n_envs:
+            found.append(row)
+    return found
 
 
 @pytest.mark.parametrize(("hindsight", "shared"), [(0.0, 0.0), (0.8, 0.0), (0.8, 0.5), (1.0, 0.0), (0.0, 1.0)])
@@ -233,7 +250,7 @@ def test_reward_and_end_follow_the_rule(hindsight: float, shared: float) -> None
     store = walked_store()
     replay = make_replay(store, termination_rule(EVENT, RADIUS), hindsight=hindsight, shared=shared)
     replay.add_rows(np.arange(10, 50))
-    imagined = check_relabelling(store, replay.sample(300), ends_in_event=True)
+    imagined = check_relabelling(store, replay.sample(300), n_ending_in_event=300 - int(300 * shared))
     expected = shared + (1.0 - shared) * hindsight
     assert abs(imagined.mean() - expected) <= (0.06 if 0 < hindsight < 1 and shared < 1 else 0.0)
 
@@ -242,10 +259,33 @@ def test_the_global_options_rule_is_the_distance_to_its_goal() -> None:
     store = walked_store()
     replay = make_replay(store, goal_rule(RADIUS), everything=True, hindsight=0.6)
     samples = replay.sample(1500)
-    imagined = check_relabelling(store, samples, ends_in_event=False)
+    imagined = check_relabelling(store, samples, n_ending_in_event=0)
     assert abs(imagined.mean() - 0.6) < 0.06
     assert set(samples.actions.numpy()[:, 0].astype(int)) == set(range(120))
     assert replay.size() == 120
+
+
+def test_no_goal_is_put_in_shortly_before_the_agent_gets_stuck() -> None:
+    """It would have been achieved, so that the way there would look safe."""
+    n_steps = DOOMED_STEPS + 30
+    store = TransitionStore(1000, OBSERVATION_DIM, 2, 1, 1)
+    for t in range(2 * n_steps):  # one walk that gets stuck, and one that does not
+        number, last = np.array([[t]], dtype=np.float32), np.array([t % n_steps == n_steps - 1])
+        store.add(
+            number,
+            number.repeat(2, 1),
+            number,
+            number.repeat(2, 1),
+            number,
+            np.full((1, 2), 1e4),
+            last,
+            last,
+            last & (t < n_steps),
+        )
+    replay = make_replay(store, goal_rule(RADIUS), everything=True, hindsight=1.0)
+    samples = replay.sample(5000)
+    kept = {int(row) for row, seen in zip(samples.actions[:, 0], samples.observations, strict=True) if seen[-1] == 1e4}
+    assert kept == set(range(30, n_steps))
 
 
 def test_both_outcomes_occur_in_the_walks() -> None:
@@ -285,7 +325,7 @@ def test_getting_stuck_costs_what_standing_there_forever_would() -> None:
 
 @pytest.mark.parametrize("shared", [0.0, 0.25, 1.0])
 def test_a_share_of_every_batch_comes_from_the_whole_store(shared: float) -> None:
-    store = walked_store()
+    store = walked_store(gets_stuck=False)
     replay = make_replay(store, termination_rule(EVENT, RADIUS), hindsight=0.0, shared=shared)
     replay.add_rows(np.array([3, 7, 11]))
     samples = replay.sample(200)
@@ -300,7 +340,7 @@ def test_without_rows_of_its_own_an_option_learns_from_the_whole_store_in_hindsi
     store = walked_store()
     replay = make_replay(store, termination_rule(EVENT, RADIUS), hindsight=0.0, shared=0.5)
     assert replay.size() == 0
-    assert check_relabelling(store, replay.sample(100), ends_in_event=True).all()
+    assert check_relabelling(store, replay.sample(100), n_ending_in_event=0).all()
 
 
 @given(st.lists(st.integers(1, 9), min_size=2, max_size=12), st.booleans())

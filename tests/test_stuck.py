@@ -17,7 +17,7 @@ from sb3_skillgraph import OptionEnv, OptionsEnv, SkillGraphAgent
 from sb3_skillgraph.controller import GLOBAL, ControllerState, Request
 from sb3_skillgraph.events import SalientEvent
 
-PIT, DEPTH = np.array([0.0, 1.4]), 0.35  # beside the way from the toy maze's start
+PIT, DEPTH = np.array([0.0, 1.4]), 0.45  # beside the way from the toy maze's start
 
 
 class Pit(gym.Wrapper):
@@ -139,7 +139,7 @@ def test_learning_resumes_exactly(tmp_path: Any) -> None:
 
 def test_adaptation_starts_over_where_it_is_told_to() -> None:
     env = pit_env()
-    agent = new_agent(env).learn(600, log_interval=None)
+    agent = new_agent(env).learn(300, log_interval=None)
     before, given_up = len(env.starts), agent.curriculum.n_stuck
     start = PIT - [DEPTH + 0.02, 0.0]
     agent.adapt(PIT, start=start, total_timesteps=400)
