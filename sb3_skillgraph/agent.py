@@ -60,8 +60,9 @@ class SkillGraphAgent(Rollouts):
     :param option_class: SB3 off-policy class of the options' policies
     :param option_kwargs: further keyword arguments for it
     :param option_view: what a policy sees of (observation, achieved goal, goal): ``"relative"`` (all, and the goal
-        relative to where the agent stands), ``"egocentric"`` (without absolute position), ``"body"`` (from a robot's body)
-        or a function; None takes the one the environment names in its attribute ``option_view``, else ``"relative"``
+        relative to where the agent stands), ``"egocentric"`` (without absolute position), ``"body"`` (from a robot's body),
+        ``"placed_body"`` (and where that is) or a function; None takes the one the environment names in its attribute
+        ``option_view``, else ``"relative"``
     :param option_timeout: environment steps an option may run [A.6]
     :param stall_steps: environment steps after which a run counts as failed that stands still; None for never
     :param event_radius: radius of salient events, in goal units; None takes the environment's ``success_radius`` or

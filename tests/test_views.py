@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from sb3_skillgraph.options.views import VIEWS, ScaledView, View, body_view, egocentric_view, relative_view
+from sb3_skillgraph.options.views import VIEWS, ScaledView, View, body_view, egocentric_view, placed_body_view, relative_view
 
 
 def rows(n: int, dim: int, seed: int) -> np.ndarray:
@@ -67,6 +67,17 @@ def test_body_view_shows_where_the_goal_lies_and_which_way_is_up() -> None:
     np.testing.assert_allclose(seen[:, -3:], [[0.6, 0.8, 1.0], [0.6, 0.8, 1.0], [0.8, -0.6, 1.0]], atol=1e-9)
     at_the_goal = body_view(observation, np.ones((3, 2)), np.ones((3, 2)))
     np.testing.assert_array_equal(at_the_goal[:, -3:], 0.0)
+
+
+def test_placed_body_view_shows_where_the_body_is_as_well() -> None:
+    observation, achieved, goal = (rows(20, dim, dim).astype(np.float64) for dim in (27, 2, 2))
+    upright = np.tile([np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)], (20, 1))  # facing along y
+    observation[:, 1:5] = upright
+    seen = placed_body_view(observation, achieved, goal)
+    assert seen.shape == (20, 33)
+    np.testing.assert_array_equal(seen[:, :29], body_view(observation, achieved, goal))
+    np.testing.assert_allclose(seen[:, 29:31] / seen[0, 29] * achieved[0, 0], achieved)
+    np.testing.assert_allclose(seen[:, 31:], [[0.0, 1.0]] * 20, atol=1e-9)
 
 
 @pytest.mark.parametrize(("observation_dim", "goal_dim"), [(10, 2), (12, 2), (27, 3)])

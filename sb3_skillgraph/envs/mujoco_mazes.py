@@ -153,7 +153,7 @@ class AntMazeEnv(MujocoMazeTask, ant_maze_v5.AntMazeEnv):
         "render_modes": ["human", "rgb_array", "depth_array"],
         "render_fps": 10,
     }
-    option_view = "body"
+    option_view = "placed_body"
     # The ant is always reset facing along x, its feet 0.88 m away from the centre on both axes.
     body_radius = 0.9
     start_margin = 0.9

@@ -6,7 +6,7 @@ import numpy as np
 
 View = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
-DISTANCE_UNIT = 0.2  # scale of the body view's distances, which are otherwise up to tens of event radii
+DISTANCE_UNIT = 0.2  # scale of the body views' distances, which are otherwise up to tens of event radii
 
 
 def relative_view(observation: np.ndarray, achieved_goal: np.ndarray, goal: np.ndarray) -> np.ndarray:
@@ -56,8 +56,7 @@ def body_view(observation: np.ndarray, achieved_goal: np.ndarray, goal: np.ndarr
             f"{observation.shape[1]} numbers and a goal {goal.shape[1]}."
         )
     w, x, y, z = observation[:, 1:5].T
-    heading = np.stack([1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z)], axis=1)
-    heading /= np.maximum(np.sqrt((heading**2).sum(axis=1, keepdims=True)), 1e-6)
+    heading = _heading(observation)
     up = np.stack([2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)], axis=1)
     joints, velocity, rest = np.split(observation[:, 5:], [n_joints, n_joints + 2], axis=1)
     offset = goal - achieved_goal
@@ -67,6 +66,29 @@ def body_view(observation: np.ndarray, achieved_goal: np.ndarray, goal: np.ndarr
     return np.concatenate(seen, axis=1)
 
 
+def placed_body_view(observation: np.ndarray, achieved_goal: np.ndarray, goal: np.ndarray) -> np.ndarray:
+    """See everything from the body, as :func:`body_view` shows it, and where the body is and which way it faces.
+
+    What has been learned in one place need not hold in another: there may be a wall.
+
+    :param observation: shape ``(m, 11 + 2 * n)``
+    :param achieved_goal: shape ``(m, 2)``
+    :param goal: shape ``(m, 2)``
+    :return: shape ``(m, 17 + 2 * n)``: what :func:`body_view` returns, position and heading
+    :raises ValueError: if observation or goals have other lengths
+    """
+    seen = body_view(observation, achieved_goal, goal)
+    return np.concatenate([seen, DISTANCE_UNIT * achieved_goal, _heading(observation)], axis=1)
+
+
+def _heading(observation: np.ndarray) -> np.ndarray:
+    """Return the direction on the floor that a body faces, shape ``(m, 2)``."""
+    w, x, y, z = observation[:, 1:5].T
+    heading = np.stack([1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z)], axis=1)
+    unit: np.ndarray = heading / np.maximum(np.sqrt((heading**2).sum(axis=1, keepdims=True)), 1e-6)
+    return unit
+
+
 def _turned(vectors: np.ndarray, heading: np.ndarray) -> np.ndarray:
     """Return what vectors are seen from a heading, shapes ``(m, 2)``."""
     cosine, sine = heading.T
@@ -74,7 +96,12 @@ def _turned(vectors: np.ndarray, heading: np.ndarray) -> np.ndarray:
     return np.stack([cosine * forward + sine * left, cosine * left - sine * forward], axis=1)
 
 
-VIEWS: dict[str, View] = {"relative": relative_view, "egocentric": egocentric_view, "body": body_view}
+VIEWS: dict[str, View] = {
+    "relative": relative_view,
+    "egocentric": egocentric_view,
+    "body": body_view,
+    "placed_body": placed_body_view,
+}
 
 
 def as_view(view: str | View | None) -> View:
