@@ -1,16 +1,19 @@
 """What the agent is compared with: goals as scheduled, covering options that lead to the ends."""
 
+import copy
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch as th
 from conftest import TOY
 from stable_baselines3 import DDPG, TD3, HerReplayBuffer
 
 from sb3_skillgraph import evaluate_pairs
 from sb3_skillgraph.baselines import CoveringOptions, GoalSchedule, OptionTask, make_her, make_recipe, make_uvfa
 from sb3_skillgraph.baselines.covering_options import TERMINATION_SHARE, LowEnd
+from sb3_skillgraph.options.learner import OptionTD3
 from sb3_skillgraph.options.option import goal_rule
 
 CORRIDOR = [[1] * 6, [1, "r", 0, 0, 0, 1], [1] * 6]
@@ -135,3 +138,22 @@ def test_steps_are_the_environments_and_decisions_fewer(covering: CoveringOption
     assert covering.model.exploration_rate == pytest.approx(0.1)
     result = evaluate_pairs(covering, TOY, env_kwargs={"maze_map": CORRIDOR}, n_pairs=5)
     assert len(result.pairs) == 5
+
+
+def test_an_ants_primitive_action_is_a_step_of_a_global_option() -> None:
+    env = gym.make("SkillGraph/AntUMaze-v0", terminate_on_success=True, max_steps=100)
+    untrained = CoveringOptions(env, n_options=2, option_updates=5, option_class=OptionTD3, shaping=1.0, batch_size=32, seed=0)
+    before = copy.deepcopy(untrained.global_option.learner.policy.state_dict())
+    learner = untrained.learn(700)
+    assert [option.id for option in learner.options] == ["c0", "c1"]
+    assert isinstance(learner.options[0].learner, OptionTD3)
+    after = learner.global_option.learner.policy.state_dict()
+    assert any(not th.equal(before[name], after[name]) for name in after)
+    observation, _ = env.reset(seed=1)
+    learner.env.reset(seed=1)
+    assert learner.env.action_masks()[-2:].all()  # the global option, and a step of it
+    step = learner.env.begin(observation, learner.env.action_space.n - 1)
+    assert (step.option, step.timeout) == (learner.global_option, 1)
+    twin = learner.copy(env)
+    actions = [agent.predict(observation, deterministic=True)[0] for agent in (learner, twin)]
+    np.testing.assert_array_equal(*actions)

@@ -14,6 +14,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from sb3_skillgraph import OptionEnv, OptionsEnv, SkillGraphAgent
+from sb3_skillgraph.baselines import CoveringOptions
 from sb3_skillgraph.controller import GLOBAL, ControllerState, Request
 from sb3_skillgraph.events import SalientEvent
 
@@ -147,6 +148,18 @@ def test_adaptation_starts_over_where_it_is_told_to() -> None:
     begun = np.array(env.starts[before:])
     exact = np.all(np.abs(begun - start) < 1e-6, axis=1)
     assert exact.sum() >= agent.curriculum.n_stuck - given_up
+
+
+def test_covering_options_start_over_too() -> None:
+    env = pit_env(terminate_on_success=True)
+    learner = CoveringOptions(env, n_options=1, option_updates=20, reach=10, seed=0).learn(1500)
+    rows = np.arange(learner.store.total)
+    fallen = in_pit(learner.store.column("next_achieved_goal", rows))
+    assert fallen.sum() > 1
+    np.testing.assert_array_equal(learner.store.stuck(rows), fallen)
+    assert not in_pit(learner.store.column("achieved_goal", rows)).any()
+    later = learner.store.future(rows[fallen], 50, np.random.default_rng(0))
+    np.testing.assert_array_equal(later, rows[fallen])  # no trajectory leads out of it
 
 
 def test_option_env_ends_and_is_reset() -> None:

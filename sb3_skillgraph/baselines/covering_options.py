@@ -10,6 +10,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.utils import LinearSchedule
 
@@ -23,6 +24,7 @@ from sb3_skillgraph.options.views import ScaledView, as_view
 from sb3_skillgraph.replay import OptionReplay, TransitionStore
 from sb3_skillgraph.salience.dco import FiedlerEmbedding, learn_fiedler
 from sb3_skillgraph.smdp import FlatPolicy, OptionsEnv, SMDPQLearning
+from sb3_skillgraph.smdp.options_env import MOST_AXES
 
 TERMINATION_SHARE = 0.05  # of the states seen, those with the lowest values are where an option ends
 
@@ -121,7 +123,12 @@ class CoveringOptions:
     :param batch_size: transitions in a minibatch
     :param gamma: discount factor per environment step
     :param exploration_noise: standard deviation of the noise on options' scaled actions while learning
+    :param option_class: SB3 class of the options' policies: ``OptionDDPG`` or ``OptionTD3``
+    :param shaping: reward of the global option for every success radius of distance gained
     :param seed: of everything random
+
+    Where actions have more than two dimensions a primitive action is one step of a global option (section 4), which learns
+    from all experience in hindsight; it can be run to the goal as well.
     """
 
     def __init__(
@@ -137,6 +144,8 @@ class CoveringOptions:
         batch_size: int = 128,
         gamma: float = 0.99,
         exploration_noise: float = 0.1,
+        option_class: type[OffPolicyAlgorithm] = OptionDDPG,
+        shaping: float = 0.0,
         seed: int = 0,
     ) -> None:
         assert isinstance(env.action_space, spaces.Box)
@@ -163,10 +172,15 @@ class CoveringOptions:
             policy_kwargs={"net_arch": [128, 128]},
         )
         self._factory = OptionFactory(
-            OptionDDPG, kwargs, self.store, view, env.action_space, radius, radius, self.rng, {}, th.device("cpu")
+            option_class, kwargs, self.store, view, env.action_space, radius, radius, self.rng, {}, th.device("cpu"), shaping
         )
+        self.global_option = self._factory.make("global", None, None) if spec.action_dim > MOST_AXES else None
         self.env = OptionsEnv(
-            _Recorder(GoalSchedule(env, goal_freq), self), self.options, max_options=n_options + 8, gamma=gamma
+            _Recorder(GoalSchedule(env, goal_freq), self),
+            self.options,
+            global_option=self.global_option,
+            max_options=n_options + 8,
+            gamma=gamma,
         )
         self.model = _QLearning(
             "MultiInputPolicy",
@@ -214,6 +228,8 @@ class CoveringOptions:
             assert isinstance(option.replay, CoveringReplay)
             twin.options.append(twin._option(option.id, option.replay.end, option.replay.scale))
             copy_policy(option, twin.options[-1])
+        if self.global_option is not None and twin.global_option is not None:
+            copy_policy(self.global_option, twin.global_option)
         twin.model.set_parameters(self.model.get_parameters())  # type: ignore[arg-type]
         twin.model.replay_buffer = copy.deepcopy(self.model.replay_buffer)
         twin.model.num_timesteps = self.model.num_timesteps
@@ -239,18 +255,20 @@ class CoveringOptions:
         """
         return self._policy.predict(observation, state, episode_start, deterministic)
 
-    def after_step(self, transition: dict[str, np.ndarray], terminated: bool, done: bool) -> None:
+    def after_step(self, transition: dict[str, np.ndarray], terminated: bool, done: bool, stuck: bool) -> None:
         """Learn from one environment step.
 
         :param transition: columns of the store, each of shape ``(1, dim)``
         :param terminated: whether the environment ended for good
         :param done: whether the episode ended
+        :param stuck: whether it was given up since the agent was stuck
         """
-        self.store.add(**transition, terminated=np.array([terminated]), done=np.array([done]))
+        ends = dict(terminated=np.array([terminated]), done=np.array([done]), stuck=np.array([stuck]))
+        self.store.add(**transition, **ends)
         self.num_timesteps += 1
-        if self.options and self.num_timesteps % self.train_freq == 0:
-            turn = self.num_timesteps // self.train_freq % len(self.options)
-            self.options[turn].learner.train(1, self.batch_size)
+        learners = [option.learner for option in (*self.options, self.global_option) if option is not None]
+        if learners and self.num_timesteps % self.train_freq == 0 and len(self.store) >= self.batch_size:
+            learners[self.num_timesteps // self.train_freq % len(learners)].train(1, self.batch_size)
         self._n_episodes += done
         if done and self._n_episodes >= self._next_option and len(self.options) < self.n_options:
             self._next_option = self._n_episodes + self.option_freq
@@ -278,7 +296,7 @@ class CoveringOptions:
         option = self._factory.make(id, "low end", end)
         plain, factory = option.replay, self._factory
         option.learner.replay_buffer = covering = CoveringReplay(
-            self.store, plain.view, plain.rule, factory.observation_space, factory.action_space, self.rng
+            self.store, plain.view, plain.rule._replace(shaping=0.0), factory.observation_space, factory.action_space, self.rng
         )
         covering.end, covering.scale = end, scale
         option.initiation = Everywhere(option.radius)
@@ -315,7 +333,8 @@ class _Recorder(gym.Wrapper):
         }
         columns = {name: np.asarray(value).reshape(1, -1) for name, value in transition.items()}
         self._last = observation
-        self.learner.after_step(columns, terminated, terminated or truncated)
+        stuck = bool(info.get("stuck"))  # OptionsEnv gives the episode up
+        self.learner.after_step(columns, terminated, terminated or truncated or stuck, stuck)
         # Steps are environment steps: an option that runs when they are spent is cut off.
         return observation, reward, terminated, truncated or self.learner.model.budget.share_left <= 0.0, info
 

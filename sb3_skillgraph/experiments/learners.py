@@ -203,6 +203,8 @@ class CoveringOptionsLearner(Learner):
 
     def __init__(self, env_id: str, env_kwargs: dict[str, Any], seed: int, arguments: dict[str, Any]) -> None:
         env = gym.make(env_id, **{"terminate_on_success": True, **env_kwargs})
+        if "option_class" in arguments:
+            arguments = {**arguments, **check_hyperparams({"option_class": arguments["option_class"]}, "arguments")}
         self.policy: CoveringOptions = CoveringOptions(env, seed=seed, **arguments)
 
     def learn(self, begin: int, end: int, every: int, check: Check) -> None:

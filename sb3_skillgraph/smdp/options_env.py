@@ -12,6 +12,7 @@ from sb3_skillgraph.options.execution import Fate, fate
 from sb3_skillgraph.options.option import Option
 
 MASK = "action_mask"
+MOST_AXES = 2  # up to so many dimensions of actions, primitive actions push along each axis
 Route = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
@@ -101,7 +102,7 @@ class OptionsEnv(gym.Wrapper):
         dim = int(np.prod(space.shape))
         if given is not None:
             primitives: list[np.ndarray | None] = list(np.asarray(given, dtype=np.float32).reshape(-1, dim))
-        elif dim <= 2:
+        elif dim <= MOST_AXES:
             axes = np.eye(dim, dtype=np.float32)
             primitives = [*axes, *-axes, np.zeros(dim, dtype=np.float32)]
         else:
