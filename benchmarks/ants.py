@@ -1,0 +1,131 @@
+"""What trained ants can do: random pairs at three tolerances, the far goal of other papers, and falls.
+
+    python -m benchmarks.ants runs/compare/ant-umaze/dsg-frontier/seed* --out benchmarks/results/ants_umaze.json
+
+The agents are the checkpoints of ``sb3-skillgraph compare benchmarks/compare_ants.yml``. Each goes from 100 random starts to
+random goals at least 2 cells of path away, as ``evaluate_pairs`` draws them; the least distance from the goal in 1000 steps
+of 0.1 s tells whether it was reached within 0.45 m (the success radius), 0.6 m (the paper's) and 0.6 of a cell (2.4 m, about
+what DHRL asks for: 5 m in cells of 8 m). *Far goal*: from the training start to the free cell with the longest path, 32 times.
+An episode ends when the ant is on its back. *Cells*: share of the maze's free squares of 1 m that were visited in the last
+50 000 steps of training, and by a random walk in as many (its episodes end with a fall, too).
+"""
+
+import argparse
+import json
+import pathlib
+import shlex
+import sys
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch as th
+
+from sb3_skillgraph import SkillGraphAgent, __version__
+from sb3_skillgraph.baselines import RandomWalk
+from sb3_skillgraph.envs import MazeGeometry
+from sb3_skillgraph.evaluation import sample_pairs
+from sb3_skillgraph.experiments.runner import CONFIG, checkpoints
+
+TOLERANCES = {"0.45 m": 0.45, "0.6 m": 0.6, "0.6 cells": 2.4}
+KINDS = ("pairs", "far", "cells")
+N_PAIRS, N_FAR, N_LAST = 100, 32, 50_000
+
+
+def walk(agent: SkillGraphAgent, env: gym.Env, options: dict[str, Any]) -> dict[str, Any]:
+    """Go to one goal; tell how near the ant came, after how many steps, and whether it fell."""
+    observation, _ = env.reset(options=options)
+    goal, state = observation["desired_goal"], None
+    nearest = float(np.linalg.norm(observation["achieved_goal"] - goal))
+    steps, over, fell = 0, False, False
+    while not over:
+        action, state = agent.predict(observation, state=state, deterministic=True)
+        observation, _, terminated, truncated, info = env.step(action)
+        steps += 1
+        nearest = min(nearest, float(np.linalg.norm(observation["achieved_goal"] - goal)))
+        fell = bool(info.get("stuck"))
+        over = terminated or truncated or fell
+    return {"goal": goal.round(3).tolist(), "nearest": round(nearest, 4), "steps": steps, "fell": fell}
+
+
+def farthest_cell(geometry: MazeGeometry) -> np.ndarray:
+    """Return the middle of the free cell with the longest path from the training start."""
+    start = geometry.cell_to_xy(*geometry.start_cell)
+    free = [geometry.cell_to_xy(*cell) for cell in np.ndindex(len(geometry.maze_map), len(geometry.maze_map[0]))]
+    free = [point for point in free if geometry.is_free(point, 0.1).all()]
+    return max(free, key=lambda point: geometry.shortest_path_length(start, point))
+
+
+def rates(walks: list[dict[str, Any]]) -> dict[str, float]:
+    """Sum up walks."""
+    reached = {name: float(np.mean([walk["nearest"] <= radius for walk in walks])) for name, radius in TOLERANCES.items()}
+    return {**reached, "fell": float(np.mean([walk["fell"] for walk in walks]))}
+
+
+def visited_share(geometry: MazeGeometry, points: np.ndarray) -> float:
+    """Return the share of the free squares of 1 m in which there are points."""
+    x_min, x_max, y_min, y_max = geometry.extent
+    corners = np.stack(np.meshgrid(np.arange(x_min, x_max), np.arange(y_min, y_max)), axis=-1).reshape(-1, 2)
+    free = {tuple(corner) for corner in corners[geometry.is_free(corners + 0.5, 0.0)]}
+    origin = np.array([x_min, y_min])
+    seen = {tuple(corner) for corner in origin + np.floor(points - origin)}
+    return len(free & seen) / len(free)
+
+
+def random_walk(env: gym.Env, seed: int) -> np.ndarray:
+    """Return where a random walk gets."""
+    assert isinstance(env.action_space, gym.spaces.Box)
+    walker, points = RandomWalk(env.action_space, seed), []
+    observation, _ = env.reset(seed=seed)
+    for _ in range(N_LAST):
+        observation, _, _, truncated, info = env.step(walker.predict(observation)[0])
+        points.append(observation["achieved_goal"])
+        if truncated or info.get("stuck"):
+            observation, _ = env.reset()
+    return np.array(points)
+
+
+def test_run(folder: pathlib.Path) -> dict[str, Any]:
+    """Test the newest checkpoint of a run."""
+    config = json.loads((folder / CONFIG).read_text())
+    env = gym.make(config["env_id"], **{"terminate_on_success": True, **config["env_kwargs"]})
+    saved = checkpoints(folder)
+    agent = SkillGraphAgent.load(saved[max(saved)] / "agent.zip", env=env)
+    agent.load_replay_buffer(saved[max(saved)] / "experience")
+    geometry, margin = env.get_wrapper_attr("geometry"), env.get_wrapper_attr("body_radius")
+    env.reset(seed=config["seed"])
+    drawn = sample_pairs(geometry, margin, N_PAIRS, config["seed"] + 1000)
+    pairs = [walk(agent, env, {"start": start, "goal": goal}) for start, goal, _ in drawn]
+    goal = farthest_cell(geometry)
+    far = [walk(agent, env, {"goal": goal}) for _ in range(N_FAR)]
+    return {
+        "seed": config["seed"],
+        "steps": max(saved),
+        "pairs": rates(pairs),
+        "far": rates(far),
+        "walks": pairs,
+        "far_walks": far,
+    }
+
+
+def main() -> None:
+    """Test runs and write what came out."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("runs", type=pathlib.Path, nargs="+")
+    parser.add_argument("--out", type=pathlib.Path, required=True)
+    args = parser.parse_args()
+    th.set_num_threads(1)
+    runs = []
+    for folder in args.runs:
+        runs.append(test_run(folder))
+        print({name: runs[-1][name] for name in ("seed", "steps", *KINDS)}, flush=True)
+    means = {
+        kind: {name: float(np.mean([run[kind][name] for run in runs])) for name in runs[0][kind]} for kind in ("pairs", "far")
+    }
+    command = f"python -m benchmarks.ants {shlex.join(sys.argv[1:])}"
+    args.out.parent.mkdir(parents=True, exist_ok=True)
+    args.out.write_text(json.dumps({"command": command, "version": __version__, **means, "runs": runs}, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

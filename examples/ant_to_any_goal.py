@@ -1,0 +1,99 @@
+"""A trained ant walks to goals of your choice, one after the other, and is filmed.
+
+    sb3-skillgraph train SkillGraph/AntUMaze-v0 --out runs/ant
+    python examples/ant_to_any_goal.py runs/ant/agent.zip --goal -4 -4 --goal 4 0 --goal -4 4
+
+Training takes about half an hour. On a machine without a screen, set MUJOCO_GL=egl (without a GPU, EGL_PLATFORM=surfaceless,
+too) or MUJOCO_GL=osmesa for the film.
+"""
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+import torch as th
+from PIL import Image
+
+from sb3_skillgraph import SkillGraphAgent
+from sb3_skillgraph.plotting import Trajectory, plot_plan, save_figure
+
+EVERY = 4  # steps of 0.1 s between two frames
+
+
+class Film:
+    """Frames of the whole maze, seen from above."""
+
+    def __init__(self, model: mujoco.MjModel, width: float) -> None:
+        self.renderer = mujoco.Renderer(model, 360, 360)
+        self.camera = mujoco.MjvCamera()
+        self.camera.distance, self.camera.elevation, self.camera.azimuth = 1.3 * width, -70.0, 90.0
+        self.frames: list[Image.Image] = []
+
+    def shoot(self, data: mujoco.MjData) -> None:
+        """Add a frame."""
+        self.renderer.update_scene(data, self.camera)
+        self.frames.append(Image.fromarray(self.renderer.render()))
+
+    def save(self, path: Path) -> None:
+        """Write the film, at four times the speed of life."""
+        self.frames[0].save(path, save_all=True, append_images=self.frames[1:], duration=100, loop=0)
+
+
+def set_goal(env: gym.Env, observation: dict[str, Any], goal: np.ndarray) -> dict[str, Any]:
+    """Change the goal where the ant stands, without a reset."""
+    task: Any = env.unwrapped
+    task.set_state({**task.get_state(), "goal": goal, "elapsed_steps": np.array(0), "has_succeeded": np.array(False)})
+    return {**observation, "desired_goal": goal}
+
+
+def walk(agent: SkillGraphAgent, env: gym.Env, observation: dict[str, Any], film: Film) -> tuple[Trajectory, Any, bool]:
+    """Go to the goal; return the way there, the last observation, and whether the ant fell on its back."""
+    points, options, state, info = [observation["achieved_goal"]], [], None, {}
+    over = False
+    while not over:
+        action, state = agent.predict(observation, state=state, deterministic=True)
+        options.append(int(state[0][0]))
+        observation, _, terminated, truncated, info = env.step(action)
+        points.append(observation["achieved_goal"])
+        if len(options) % EVERY == 0:
+            film.shoot(env.unwrapped.data)
+        fell = bool(info.get("stuck"))
+        over = terminated or truncated or fell
+    goal = observation["desired_goal"]
+    return Trajectory(np.stack(points), np.array(options), goal, bool(info["is_success"])), observation, fell
+
+
+parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+parser.add_argument("agent", type=Path, help="a trained agent")
+parser.add_argument("--env", default="SkillGraph/AntUMaze-v0", help="where it was trained")
+parser.add_argument("--goal", type=float, nargs=2, action="append", metavar=("X", "Y"), required=True, help="in metres")
+parser.add_argument("--out", type=Path, default=Path("runs/ant_to_any_goal"), help="folder for film and pictures")
+args = parser.parse_args()
+
+th.set_num_threads(1)
+args.out.mkdir(parents=True, exist_ok=True)
+env = gym.make(args.env, terminate_on_success=True)
+agent = SkillGraphAgent.load(args.agent, env=env)
+geometry = env.get_wrapper_attr("geometry")
+x_min, x_max, _, _ = geometry.extent
+
+observation, _ = env.reset(seed=0, options={"goal": args.goal[0]})
+film = Film(env.unwrapped.model, x_max - x_min)
+for number, goal in enumerate(np.array(args.goal)):
+    if not geometry.is_free(goal, 0.0).all():
+        raise SystemExit(f"the goal {goal.tolist()} lies in a wall; the maze covers {geometry.extent}")
+    observation = set_goal(env, observation, goal)
+    plan = agent.plan(observation)
+    trajectory, observation, fell = walk(agent, env, observation, film)
+    outcome = "reached" if trajectory.success else "fell on its back" if fell else "not reached"
+    print(f"goal {goal.tolist()}: {plan.status}, {len(trajectory.options)} steps, {outcome}")
+    save_figure(plot_plan(agent, geometry, trajectory, plan), args.out / f"way_{number}.png")
+    if fell:
+        observation, _ = env.reset()
+film.save(args.out / "ant.gif")
+film.frames[-1].save(args.out / "ant.png")
+print(f"film and pictures are in {args.out}")
+env.close()
