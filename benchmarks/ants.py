@@ -98,14 +98,15 @@ def test_run(folder: pathlib.Path) -> dict[str, Any]:
     pairs = [walk(agent, env, {"start": start, "goal": goal}) for start, goal, _ in drawn]
     goal = farthest_cell(geometry)
     far = [walk(agent, env, {"goal": goal}) for _ in range(N_FAR)]
-    return {
-        "seed": config["seed"],
-        "steps": max(saved),
-        "pairs": rates(pairs),
-        "far": rates(far),
-        "walks": pairs,
-        "far_walks": far,
+    last = np.arange(max(agent.store.oldest, agent.store.total - N_LAST), agent.store.total)
+    visits = {
+        "agent": visited_share(geometry, agent.store.column("next_achieved_goal", last)),
+        "random walk": visited_share(
+            geometry, random_walk(gym.make(config["env_id"], **config["env_kwargs"]), config["seed"])
+        ),
     }
+    summary = {"pairs": rates(pairs), "far": rates(far), "cells": visits}
+    return {"seed": config["seed"], "steps": max(saved), **summary, "walks": pairs, "far_walks": far}
 
 
 def main() -> None:

@@ -39,7 +39,6 @@ def summarise(specs: list[RunSpec], out: pathlib.Path) -> list[dict[str, Any]]:
                 "high": high,
                 "worst": scores.min(),
                 "best": scores.max(),
-                "training_minutes": np.mean([document["seconds"] for document in done]) / 60,
             }
         )
     order = list(dict.fromkeys(row["environment"] for row in rows))
@@ -56,7 +55,6 @@ def line(row: dict[str, Any]) -> str:
         f"{row['iqm']:.3f} ({row['low']:.3f} to {row['high']:.3f})",
         f"{row['worst']:.2f} to {row['best']:.2f}",
         str(row["seeds"]),
-        f"{row['training_minutes']:.1f}",
     ]
     return f"| {' | '.join(cells)} |"
 
@@ -72,7 +70,7 @@ def main() -> None:
         writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
         writer.writeheader()
         writer.writerows({k: round(v, 4) if isinstance(v, float) else v for k, v in row.items()} for row in rows)
-    columns = ("Task", "Steps", "Method", "Mean", "IQM (95 %)", "Seeds' range", "Seeds", "Minutes to train")
+    columns = ("Task", "Steps", "Method", "Mean", "IQM (95 %)", "Seeds' range", "Seeds")
     print("\n".join([f"| {' | '.join(columns)} |", "|---" * len(columns) + "|", *map(line, rows)]))
 
 
