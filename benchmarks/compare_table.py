@@ -66,6 +66,8 @@ def main() -> None:
     parser.add_argument("out", type=pathlib.Path, help="folder of all runs")
     args = parser.parse_args()
     rows = summarise(load_plan(args.plan), args.out)
+    if not rows:
+        raise SystemExit(f"no run of {args.plan} is finished in {args.out}")
     with (args.out / "summary.csv").open("w", newline="") as file:
         writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
         writer.writeheader()

@@ -3,7 +3,7 @@
     sb3-skillgraph train SkillGraph/AntUMaze-v0 --out runs/ant
     python examples/ant_to_any_goal.py runs/ant/agent.zip --goal -4 -4 --goal 4 0 --goal -4 4
 
-Training takes about half an hour. On a machine without a screen, set MUJOCO_GL=egl (without a GPU, EGL_PLATFORM=surfaceless,
+Training takes about 20 minutes. On a machine without a screen, set MUJOCO_GL=egl (without a GPU, EGL_PLATFORM=surfaceless,
 too) or MUJOCO_GL=osmesa for the film.
 """
 
@@ -18,6 +18,7 @@ import torch as th
 from PIL import Image
 
 from sb3_skillgraph import SkillGraphAgent
+from sb3_skillgraph.envs.mujoco_mazes import MujocoMazeTask
 from sb3_skillgraph.plotting import Trajectory, plot_plan, save_figure
 
 EVERY = 4  # steps of 0.1 s between two frames
@@ -29,7 +30,7 @@ class Film:
     def __init__(self, model: mujoco.MjModel, width: float) -> None:
         self.renderer = mujoco.Renderer(model, 360, 360)
         self.camera = mujoco.MjvCamera()
-        self.camera.distance, self.camera.elevation, self.camera.azimuth = 1.3 * width, -70.0, 90.0
+        self.camera.distance, self.camera.elevation, self.camera.azimuth = width, -85.0, 90.0
         self.frames: list[Image.Image] = []
 
     def shoot(self, data: mujoco.MjData) -> None:
@@ -74,18 +75,23 @@ parser.add_argument("--out", type=Path, default=Path("runs/ant_to_any_goal"), he
 args = parser.parse_args()
 
 th.set_num_threads(1)
+try:
+    env = gym.make(args.env, terminate_on_success=True)
+    agent = SkillGraphAgent.load(args.agent, env=env)
+    for goal in args.goal:
+        observation, _ = env.reset(seed=0, options={"goal": goal})  # refuses walls
+except (OSError, ValueError, TypeError, gym.error.Error) as error:
+    parser.error(str(error))
+if not isinstance(env.unwrapped, MujocoMazeTask):
+    parser.error(f"{args.env} is no maze of MuJoCo, and cannot be filmed")
 args.out.mkdir(parents=True, exist_ok=True)
-env = gym.make(args.env, terminate_on_success=True)
-agent = SkillGraphAgent.load(args.agent, env=env)
 geometry = env.get_wrapper_attr("geometry")
 x_min, x_max, _, _ = geometry.extent
 
-observation, _ = env.reset(seed=0, options={"goal": args.goal[0]})
 film = Film(env.unwrapped.model, x_max - x_min)
 for number, goal in enumerate(np.array(args.goal)):
-    if not geometry.is_free(goal, 0.0).all():
-        raise SystemExit(f"the goal {goal.tolist()} lies in a wall; the maze covers {geometry.extent}")
     observation = set_goal(env, observation, goal)
+    film.shoot(env.unwrapped.data)
     plan = agent.plan(observation)
     trajectory, observation, fell = walk(agent, env, observation, film)
     outcome = "reached" if trajectory.success else "fell on its back" if fell else "not reached"

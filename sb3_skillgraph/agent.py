@@ -76,7 +76,8 @@ class SkillGraphAgent(Rollouts):
     :param saturation_penalty: weight, in the loss of ``OptionDDPG``'s and ``OptionTD3``'s actors, of the mean square of
         what their tanh is given: keeps them from getting stuck at the bounds of the actions
     :param shaping: reward for every event radius of distance gained, beside -1 a step; 0 for none [2.1]
-    :param hindsight: share of sampled transitions relabelled with a goal achieved later
+    :param hindsight: share of sampled transitions relabelled with a goal achieved later (none shortly before the agent gets
+        stuck)
     :param goal_tolerance: how near the global option must come to a goal, and any option to one put in by hindsight, for
         it to learn that it has reached it; in event radii
     :param shared_experience: share of an option's batches drawn from all experience rather than its own runs
@@ -111,7 +112,7 @@ class SkillGraphAgent(Rollouts):
     :param nearest: vertex nearest to a goal: by ``"steps"`` along trajectories or ``"euclidean"`` distance [3.2.3]
     :param exploration_noise: standard deviation of Gaussian action noise, in units of the scaled action
     :param random_action_prob: probability of a uniformly random action
-    :param random_hold: a random action is held for up to so many steps
+    :param random_hold: a random action is held for so many steps in the mean
     :raises ValueError: if the environment is no goal environment with Box actions, or an argument is refused
     """
 

@@ -157,3 +157,14 @@ def test_an_ants_primitive_action_is_a_step_of_a_global_option() -> None:
     twin = learner.copy(env)
     actions = [agent.predict(observation, deterministic=True)[0] for agent in (learner, twin)]
     np.testing.assert_array_equal(*actions)
+
+
+def test_learning_on_begins_a_new_trajectory() -> None:
+    learner = CoveringOptions(toy(), n_options=1, option_updates=1, reach=10, seed=0).learn(150).learn(150)
+    store, rows = learner.store, np.arange(299)
+    trajectory = store.get_state()["trajectory"]
+    same = trajectory[1:] == trajectory[:-1]
+    assert not same[149]
+    np.testing.assert_array_equal(
+        store.column("achieved_goal", rows[same] + 1), store.column("next_achieved_goal", rows[same])
+    )

@@ -265,27 +265,20 @@ def test_the_global_options_rule_is_the_distance_to_its_goal() -> None:
     assert replay.size() == 120
 
 
-def test_no_goal_is_put_in_shortly_before_the_agent_gets_stuck() -> None:
+@pytest.mark.parametrize("n_envs", [1, 2])
+def test_no_goal_is_put_in_shortly_before_the_agent_gets_stuck(n_envs: int) -> None:
     """It would have been achieved, so that the way there would look safe."""
     n_steps = DOOMED_STEPS + 30
-    store = TransitionStore(1000, OBSERVATION_DIM, 2, 1, 1)
-    for t in range(2 * n_steps):  # one walk that gets stuck, and one that does not
-        number, last = np.array([[t]], dtype=np.float32), np.array([t % n_steps == n_steps - 1])
-        store.add(
-            number,
-            number.repeat(2, 1),
-            number,
-            number.repeat(2, 1),
-            number,
-            np.full((1, 2), 1e4),
-            last,
-            last,
-            last & (t < n_steps),
-        )
+    store = SpyStore(3 * n_steps * n_envs // 2, OBSERVATION_DIM, 2, 1, n_envs)
+    for t in range(2 * n_steps):  # walks that get stuck, half of the first overwritten; then walks that do not
+        number = np.arange(t * n_envs, (t + 1) * n_envs, dtype=np.float32)[:, None]
+        last = np.full(n_envs, t % n_steps == n_steps - 1)
+        point, pursued = number.repeat(2, 1), np.full((n_envs, 2), 1e4)
+        store.add(number, point, number, point, number, pursued, last, last, last & (t < n_steps))
     replay = make_replay(store, goal_rule(RADIUS), everything=True, hindsight=1.0)
-    samples = replay.sample(5000)
+    samples = replay.sample(8000)
     kept = {int(row) for row, seen in zip(samples.actions[:, 0], samples.observations, strict=True) if seen[-1] == 1e4}
-    assert kept == set(range(30, n_steps))
+    assert kept == set(range(n_envs * max(30, n_steps // 2), n_envs * n_steps))
 
 
 def test_both_outcomes_occur_in_the_walks() -> None:

@@ -82,7 +82,7 @@ def test_placed_body_view_shows_where_the_body_is_as_well() -> None:
 
 @pytest.mark.parametrize(("observation_dim", "goal_dim"), [(10, 2), (12, 2), (27, 3)])
 def test_body_view_refuses_what_is_no_such_body(observation_dim: int, goal_dim: int) -> None:
-    with pytest.raises(ValueError, match="option_view='body' is for free bodies"):
+    with pytest.raises(ValueError, match="The body views are for free bodies"):
         body_view(rows(2, observation_dim, 0), rows(2, goal_dim, 1), rows(2, goal_dim, 2))
 
 

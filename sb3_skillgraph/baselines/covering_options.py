@@ -10,7 +10,6 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.utils import LinearSchedule
 
@@ -18,7 +17,7 @@ from sb3_skillgraph.baselines.goal_conditioned import GoalSchedule
 from sb3_skillgraph.goal_env import GoalSpec
 from sb3_skillgraph.options.factory import OptionFactory, copy_policy
 from sb3_skillgraph.options.initiation import InitiationSet
-from sb3_skillgraph.options.learner import OptionDDPG
+from sb3_skillgraph.options.learner import OptionDDPG, OptionTD3
 from sb3_skillgraph.options.option import Option
 from sb3_skillgraph.options.views import ScaledView, as_view
 from sb3_skillgraph.replay import OptionReplay, TransitionStore
@@ -144,7 +143,7 @@ class CoveringOptions:
         batch_size: int = 128,
         gamma: float = 0.99,
         exploration_noise: float = 0.1,
-        option_class: type[OffPolicyAlgorithm] = OptionDDPG,
+        option_class: type[OptionDDPG] | type[OptionTD3] = OptionDDPG,
         shaping: float = 0.0,
         seed: int = 0,
     ) -> None:
@@ -210,6 +209,7 @@ class CoveringOptions:
         :return: itself
         """
         self._on_step = on_step
+        self.store.cut()  # the environment is reset
         episodes = total_timesteps // int(self.env.get_wrapper_attr("max_steps"))
         self._next_option = self.option_freq = max(1, min(self.option_freq, episodes // (2 * self.n_options)))
         self.model.budget.start, self.model.budget.total = self.num_timesteps, total_timesteps

@@ -17,9 +17,11 @@ from sb3_skillgraph.agent import SkillGraphAgent
 from sb3_skillgraph.baselines import CoveringOptions, OptionTask, RandomWalk, make_her, make_recipe, make_uvfa
 from sb3_skillgraph.evaluation import Predictor
 from sb3_skillgraph.hyperparams import check_hyperparams, load_hyperparams
+from sb3_skillgraph.options.learner import OptionDDPG, OptionTD3
 from sb3_skillgraph.plotting import event_links, near_links
 
 Check = Callable[[int], None]
+_COVERING_CLASSES = {"OptionDDPG": OptionDDPG, "OptionTD3": OptionTD3}
 
 
 class Learner(ABC):
@@ -203,9 +205,11 @@ class CoveringOptionsLearner(Learner):
 
     def __init__(self, env_id: str, env_kwargs: dict[str, Any], seed: int, arguments: dict[str, Any]) -> None:
         env = gym.make(env_id, **{"terminate_on_success": True, **env_kwargs})
-        if "option_class" in arguments:
-            arguments = {**arguments, **check_hyperparams({"option_class": arguments["option_class"]}, "arguments")}
-        self.policy: CoveringOptions = CoveringOptions(env, seed=seed, **arguments)
+        name = arguments.get("option_class", "OptionDDPG")
+        if name not in _COVERING_CLASSES:
+            raise ValueError(f"option_class is {' or '.join(_COVERING_CLASSES)} for covering options, not {name!r}.")
+        given = {**arguments, "option_class": _COVERING_CLASSES[name]}
+        self.policy: CoveringOptions = CoveringOptions(env, seed=seed, **given)
 
     def learn(self, begin: int, end: int, every: int, check: Check) -> None:
         """Learn in one go."""

@@ -51,7 +51,7 @@ def body_view(observation: np.ndarray, achieved_goal: np.ndarray, goal: np.ndarr
     n_joints, odd = divmod(observation.shape[1] - 11, 2)
     if odd or n_joints < 0 or goal.shape[1] != 2:
         raise ValueError(
-            "option_view='body' is for free bodies of MuJoCo: goals are positions (x, y), the observation is height, "
+            "The body views are for free bodies of MuJoCo: goals are positions (x, y), the observation is height, "
             "quaternion, joint angles and all velocities. Here an observation has "
             f"{observation.shape[1]} numbers and a goal {goal.shape[1]}."
         )
