@@ -1,6 +1,7 @@
 """The paper's figures, redrawn from stored runs."""
 
 import json
+from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -153,8 +154,10 @@ def curves(specs: Sequence[RunSpec], out: Path) -> Axes:
     methods = list(dict.fromkeys(spec.method for spec in specs))
     panels = draw.new_panels(len(labels) * (1 + any(testing)), n_rows=1 + any(testing))
     for axes, by_method, here, label in zip(panels, training, by_label, labels, strict=False):
-        seeds = {spec.seed for spec in here if (spec.folder(out) / DONE).exists()}
-        draw.plot_curves(axes, by_method, methods, f"{label} ({len(seeds)} seeds)")
+        seeds = Counter(spec.method for spec in here if (spec.folder(out) / DONE).exists()).values()
+        fewest, most = min(seeds, default=0), max(seeds, default=0)
+        n_seeds = f"{most}" if fewest == most else f"{fewest} to {most}"
+        draw.plot_curves(axes, by_method, methods, f"{label} ({n_seeds} seeds)")
     if any(testing):
         for axes, by_method, label in zip(panels[len(labels) :], testing, labels, strict=True):
             draw.plot_curves(axes, by_method, methods, f"{label}, at test time", "environment steps with the goal")
@@ -284,6 +287,6 @@ def failure_of_dco(specs: Sequence[RunSpec], out: Path) -> Axes:
         pairs = json.loads((spec.folder(out) / DONE).read_text())["pairs"]
         missed = np.array([pair["goal"] for pair in pairs if not pair["success"]]).reshape(-1, agent.graph.goal_dim)
         centers = np.array([event.center for event in agent.events])
-        title = f"{_name(spec)}: {len(centers)} events, {len(missed)} of {len(pairs)} goals missed"
+        title = f"{_name(spec)}:\n{len(centers)} events, {len(missed)} of {len(pairs)} goals missed"
         draw.plot_missed(axes, agent.visited.points, centers, missed, _geometry(spec), title)
     return panels[0]

@@ -9,6 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
+from matplotlib.ticker import EngFormatter
 
 from sb3_skillgraph.envs import MazeGeometry
 from sb3_skillgraph.plotting import figures
@@ -130,6 +131,7 @@ def plot_curves(
         axes.plot(curve.steps, curve.mean, label=name, color=colour, marker="o", markersize=3)
         axes.fill_between(curve.steps, curve.low, curve.high, color=colour, alpha=0.15, linewidth=0)
     axes.set(title=title, xlabel=x_label, ylabel="success rate (interquartile mean)", ylim=(-0.02, 1.02))
+    axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     axes.grid(alpha=0.3)
 
 
