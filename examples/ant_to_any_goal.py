@@ -52,7 +52,9 @@ def set_goal(env: gym.Env, observation: dict[str, Any], goal: np.ndarray) -> dic
 
 def walk(agent: SkillGraphAgent, env: gym.Env, observation: dict[str, Any], film: Film) -> tuple[Trajectory, Any, bool]:
     """Go to the goal; return the way there, the last observation, and whether the ant fell on its back."""
-    points, options, state, info = [observation["achieved_goal"]], [], None, {}
+    task: Any = env.unwrapped
+    points, options = [observation["achieved_goal"]], []
+    state: Any = None
     over = False
     while not over:
         action, state = agent.predict(observation, state=state, deterministic=True)
@@ -60,7 +62,7 @@ def walk(agent: SkillGraphAgent, env: gym.Env, observation: dict[str, Any], film
         observation, _, terminated, truncated, info = env.step(action)
         points.append(observation["achieved_goal"])
         if len(options) % EVERY == 0:
-            film.shoot(env.unwrapped.data)
+            film.shoot(task.data)
         fell = bool(info.get("stuck"))
         over = terminated or truncated or fell
     goal = observation["desired_goal"]
@@ -84,14 +86,15 @@ except (OSError, ValueError, TypeError, gym.error.Error) as error:
     parser.error(str(error))
 if not isinstance(env.unwrapped, MujocoMazeTask):
     parser.error(f"{args.env} is no maze of MuJoCo, and cannot be filmed")
+task: Any = env.unwrapped
 args.out.mkdir(parents=True, exist_ok=True)
 geometry = env.get_wrapper_attr("geometry")
 x_min, x_max, _, _ = geometry.extent
 
-film = Film(env.unwrapped.model, x_max - x_min)
+film = Film(task.model, x_max - x_min)
 for number, goal in enumerate(np.array(args.goal)):
     observation = set_goal(env, observation, goal)
-    film.shoot(env.unwrapped.data)
+    film.shoot(task.data)
     plan = agent.plan(observation)
     trajectory, observation, fell = walk(agent, env, observation, film)
     outcome = "reached" if trajectory.success else "fell on its back" if fell else "not reached"
