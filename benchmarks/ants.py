@@ -25,6 +25,7 @@ from sb3_skillgraph import SkillGraphAgent, __version__
 from sb3_skillgraph.baselines import RandomWalk
 from sb3_skillgraph.envs import MazeGeometry
 from sb3_skillgraph.evaluation import sample_pairs
+from sb3_skillgraph.experiments.learners import load_agent
 from sb3_skillgraph.experiments.runner import CONFIG, checkpoints
 
 TOLERANCES = {"0.45 m": 0.45, "0.6 m": 0.6, "0.6 cells": 2.4}
@@ -90,8 +91,7 @@ def test_run(folder: pathlib.Path) -> dict[str, Any]:
     config = json.loads((folder / CONFIG).read_text())
     env = gym.make(config["env_id"], **{"terminate_on_success": True, **config["env_kwargs"]})
     saved = checkpoints(folder)
-    agent = SkillGraphAgent.load(saved[max(saved)] / "agent.zip", env=env)
-    agent.load_replay_buffer(saved[max(saved)] / "experience")
+    agent = load_agent(saved[max(saved)], env)
     geometry, margin = env.get_wrapper_attr("geometry"), env.get_wrapper_attr("body_radius")
     env.reset(seed=config["seed"])
     drawn = sample_pairs(geometry, margin, N_PAIRS, config["seed"] + 1000)

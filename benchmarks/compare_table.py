@@ -5,33 +5,29 @@ python -m benchmarks.compare_table benchmarks/compare.yml benchmarks/results/com
 
 import argparse
 import csv
-import json
 import pathlib
 from typing import Any
 
 import numpy as np
 
 from sb3_skillgraph.experiments.plan import RunSpec, load_plan
-from sb3_skillgraph.experiments.runner import DONE
+from sb3_skillgraph.experiments.runner import status
 from sb3_skillgraph.experiments.summary import estimate
 
 
 def summarise(specs: list[RunSpec], out: pathlib.Path) -> list[dict[str, Any]]:
     """Return a row for every method on every environment that has a finished run, the best first."""
     rows = []
-    groups = dict.fromkeys((spec.environment, spec.method) for spec in specs)
-    for environment, method in groups:
-        here = [spec for spec in specs if (spec.environment, spec.method) == (environment, method)]
-        done = [json.loads((spec.folder(out) / DONE).read_text()) for spec in here if (spec.folder(out) / DONE).exists()]
-        if not done:
-            continue
-        scores = np.array([document["success_rate"] for document in done])
+    done = [run for run in status(specs, out) if run.state == "done"]
+    for environment, method in dict.fromkeys((run.spec.environment, run.spec.method) for run in done):
+        here = [run for run in done if (run.spec.environment, run.spec.method) == (environment, method)]
+        scores = np.array([run.success_rate for run in here])
         iqm, low, high = estimate(scores[None])
         rows.append(
             {
                 "environment": environment,
                 "method": method,
-                "steps": here[0].steps,
+                "steps": here[0].spec.steps,
                 "seeds": len(scores),
                 "mean": scores.mean(),
                 "iqm": iqm,

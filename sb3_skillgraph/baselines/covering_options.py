@@ -266,9 +266,10 @@ class CoveringOptions:
         ends = dict(terminated=np.array([terminated]), done=np.array([done]), stuck=np.array([stuck]))
         self.store.add(**transition, **ends)
         self.num_timesteps += 1
-        learners = [option.learner for option in (*self.options, self.global_option) if option is not None]
-        if learners and self.num_timesteps % self.train_freq == 0 and len(self.store) >= self.batch_size:
-            learners[self.num_timesteps // self.train_freq % len(learners)].train(1, self.batch_size)
+        if self.num_timesteps % self.train_freq == 0 and len(self.store) >= self.batch_size:
+            learners = [option.learner for option in (*self.options, self.global_option) if option is not None]
+            if learners:
+                learners[self.num_timesteps // self.train_freq % len(learners)].train(1, self.batch_size)
         self._n_episodes += done
         if done and self._n_episodes >= self._next_option and len(self.options) < self.n_options:
             self._next_option = self._n_episodes + self.option_freq

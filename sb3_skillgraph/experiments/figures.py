@@ -12,6 +12,7 @@ from matplotlib.axes import Axes
 from sb3_skillgraph.agent import SkillGraphAgent
 from sb3_skillgraph.baselines import RandomWalk
 from sb3_skillgraph.envs import MazeGeometry
+from sb3_skillgraph.experiments.learners import load_agent
 from sb3_skillgraph.experiments.plan import RunSpec
 from sb3_skillgraph.experiments.runner import DONE, STEPS, STRETCH, checkpoints, read_progress
 from sb3_skillgraph.experiments.summary import estimate
@@ -75,10 +76,7 @@ def _agent(spec: RunSpec, out: Path) -> SkillGraphAgent:
     saved = checkpoints(spec.folder(out))
     if not saved:
         raise MissingRunError(f"{spec.folder(out)} has no checkpoint any more.")
-    folder = saved[max(saved)]
-    agent = SkillGraphAgent.load(folder / "agent.zip", env=gym.make(spec.env_id, **spec.env_kwargs))
-    agent.load_replay_buffer(folder / "experience")
-    return agent
+    return load_agent(saved[max(saved)], gym.make(spec.env_id, **spec.env_kwargs))
 
 
 def _geometry(spec: RunSpec) -> MazeGeometry:

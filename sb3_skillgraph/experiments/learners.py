@@ -82,6 +82,17 @@ class Learner(ABC):
         return None
 
 
+def load_agent(folder: Path, env: gym.Env) -> SkillGraphAgent:
+    """Load an agent and its experience.
+
+    :param folder: a checkpoint of a skill graph's run
+    :param env: the environment it is to go on in
+    """
+    agent = SkillGraphAgent.load(folder / "agent.zip", env=env)
+    agent.load_replay_buffer(folder / "experience")
+    return agent
+
+
 class SkillGraphLearner(Learner):
     """Deep Skill Graphs; episodes do not end at goals, and there is no reward."""
 
@@ -107,8 +118,7 @@ class SkillGraphLearner(Learner):
 
     def load(self, folder: Path) -> None:
         """Load both."""
-        self.policy = SkillGraphAgent.load(folder / "agent.zip", env=self.env)
-        self.policy.load_replay_buffer(folder / "experience")
+        self.policy = load_agent(folder, self.env)
 
     def practise(self, env: gym.Env, start: np.ndarray, goal: np.ndarray, stretches: list[int]) -> Iterator[Predictor]:
         """Adapt a copy; its episodes do not end at the goal."""

@@ -48,22 +48,7 @@ def body_view(observation: np.ndarray, achieved_goal: np.ndarray, goal: np.ndarr
         distance from it
     :raises ValueError: if observation or goals have other lengths
     """
-    n_joints, odd = divmod(observation.shape[1] - 11, 2)
-    if odd or n_joints < 0 or goal.shape[1] != 2:
-        raise ValueError(
-            "The body views are for free bodies of MuJoCo: goals are positions (x, y), the observation is height, "
-            "quaternion, joint angles and all velocities. Here an observation has "
-            f"{observation.shape[1]} numbers and a goal {goal.shape[1]}."
-        )
-    w, x, y, z = observation[:, 1:5].T
-    heading = _heading(observation)
-    up = np.stack([2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)], axis=1)
-    joints, velocity, rest = np.split(observation[:, 5:], [n_joints, n_joints + 2], axis=1)
-    offset = goal - achieved_goal
-    distance = np.sqrt((offset**2).sum(axis=1, keepdims=True))
-    direction = _turned(offset / np.maximum(distance, 1e-6), heading)
-    seen = [observation[:, :1], up, joints, _turned(velocity, heading), rest, direction, DISTANCE_UNIT * distance]
-    return np.concatenate(seen, axis=1)
+    return _seen_from_body(observation, achieved_goal, goal)[0]
 
 
 def placed_body_view(observation: np.ndarray, achieved_goal: np.ndarray, goal: np.ndarray) -> np.ndarray:
@@ -77,16 +62,29 @@ def placed_body_view(observation: np.ndarray, achieved_goal: np.ndarray, goal: n
     :return: shape ``(m, 17 + 2 * n)``: what :func:`body_view` returns, position and heading
     :raises ValueError: if observation or goals have other lengths
     """
-    seen = body_view(observation, achieved_goal, goal)
-    return np.concatenate([seen, DISTANCE_UNIT * achieved_goal, _heading(observation)], axis=1)
+    seen, heading = _seen_from_body(observation, achieved_goal, goal)
+    return np.concatenate([seen, DISTANCE_UNIT * achieved_goal, heading], axis=1)
 
 
-def _heading(observation: np.ndarray) -> np.ndarray:
-    """Return the direction on the floor that a body faces, shape ``(m, 2)``."""
+def _seen_from_body(observation: np.ndarray, achieved_goal: np.ndarray, goal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return what :func:`body_view` returns, and the direction on the floor that the body faces, shape ``(m, 2)``."""
+    n_joints, odd = divmod(observation.shape[1] - 11, 2)
+    if odd or n_joints < 0 or goal.shape[1] != 2:
+        raise ValueError(
+            "The body views are for free bodies of MuJoCo: goals are positions (x, y), the observation is height, "
+            "quaternion, joint angles and all velocities. Here an observation has "
+            f"{observation.shape[1]} numbers and a goal {goal.shape[1]}."
+        )
     w, x, y, z = observation[:, 1:5].T
     heading = np.stack([1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z)], axis=1)
-    unit: np.ndarray = heading / np.maximum(np.sqrt((heading**2).sum(axis=1, keepdims=True)), 1e-6)
-    return unit
+    heading /= np.maximum(np.sqrt((heading**2).sum(axis=1, keepdims=True)), 1e-6)
+    up = np.stack([2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)], axis=1)
+    joints, velocity, rest = np.split(observation[:, 5:], [n_joints, n_joints + 2], axis=1)
+    offset = goal - achieved_goal
+    distance = np.sqrt((offset**2).sum(axis=1, keepdims=True))
+    direction = _turned(offset / np.maximum(distance, 1e-6), heading)
+    seen = [observation[:, :1], up, joints, _turned(velocity, heading), rest, direction, DISTANCE_UNIT * distance]
+    return np.concatenate(seen, axis=1), heading
 
 
 def _turned(vectors: np.ndarray, heading: np.ndarray) -> np.ndarray:
