@@ -197,6 +197,25 @@ class TransitionStore:
             self._last_row = np.full(1024, -1, dtype=np.int64)
 
 
+def as_rows(before: dict[str, np.ndarray], action: np.ndarray, after: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return one step of one environment as :meth:`TransitionStore.add` takes it, without its ends.
+
+    :param before: the observation before the step
+    :param action: scaled to [-1, 1]
+    :param after: the observation after it
+    :return: arrays of shape ``(1, dim)`` by name
+    """
+    row = {
+        "observation": before["observation"],
+        "achieved_goal": before["achieved_goal"],
+        "next_observation": after["observation"],
+        "next_achieved_goal": after["achieved_goal"],
+        "action": action,
+        "goal": before["desired_goal"],
+    }
+    return {name: np.asarray(value).reshape(1, -1) for name, value in row.items()}
+
+
 class OptionRule(NamedTuple):
     """What an option is paid for and where it ends (section 2.1): -1 a step, and 0 on reaching its goal, which ends it.
 

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import torch as th
 from conftest import TOY
-from stable_baselines3 import DDPG, TD3, HerReplayBuffer
+from stable_baselines3 import DDPG, HerReplayBuffer
 
 from sb3_skillgraph import evaluate_pairs
-from sb3_skillgraph.baselines import CoveringOptions, GoalSchedule, OptionTask, make_her, make_recipe, make_uvfa
+from sb3_skillgraph.baselines import CoveringOptions, GoalSchedule, HindsightRecipe, OptionTask, make_her, make_uvfa
 from sb3_skillgraph.baselines.covering_options import TERMINATION_SHARE, LowEnd
 from sb3_skillgraph.options.learner import OptionTD3
 from sb3_skillgraph.options.option import goal_rule
@@ -61,7 +61,7 @@ class Sinks(gym.Wrapper):
         return *step, {**info, "stuck": self.n_steps == 3}
 
 
-def test_the_recipe_pays_as_options_are_paid() -> None:
+def test_a_baseline_is_paid_as_options_are_paid() -> None:
     task = OptionTask(Sinks(toy()), goal_rule(0.45, gamma=0.9, shaping=2.0))
     goal = np.array([1.0, 1.0])
     before = task.reset(seed=0, options={"start": [-1.0, 1.0], "goal": goal})[0]["achieved_goal"]
@@ -78,12 +78,37 @@ def test_the_recipe_pays_as_options_are_paid() -> None:
         before = after
 
 
-def test_the_recipe_learns_by_sb3s_own_classes() -> None:
-    model = make_recipe(toy(), seed=0, shaping=1.0, learning_starts=300, batch_size=64)
-    assert type(model) is TD3
-    assert isinstance(model.replay_buffer, HerReplayBuffer)
-    model.learn(2_000)
-    assert evaluate_pairs(model, TOY, n_pairs=30).success_rate >= 0.4
+def test_the_recipe_learns_without_a_graph() -> None:
+    seen: list[int] = []
+    recipe = HindsightRecipe(toy(), seed=0, learning_starts=300, batch_size=64).learn(2_000, seen.append)
+    agent = recipe.agent
+    assert seen == list(range(1, 2_001)) and agent.store.total == 2_000
+    assert agent.global_option.learner._n_updates == (2_000 - 300) // 2 + 1
+    assert not agent.planning and not agent.events
+    assert evaluate_pairs(agent, TOY, n_pairs=30).success_rate >= 0.4
+
+
+def test_the_recipe_ends_episodes_at_goals_and_falls_but_knows_them_apart() -> None:
+    store = HindsightRecipe(toy(), seed=0, learning_starts=10_000).learn(1_000).agent.store
+    last = np.flatnonzero(np.diff(store._trajectory[:1_000]))
+    distance = np.linalg.norm(store.column("next_achieved_goal", last) - store.column("goal", last), axis=1)
+    assert (distance <= 0.45).sum() >= 3
+    assert not store.terminated(np.arange(1_000)).any(), "an end at the episode's own goal is no end for another"
+    store = HindsightRecipe(Sinks(toy()), seed=0, learning_starts=10_000).learn(30).agent.store
+    falls = np.flatnonzero(store.stuck(np.arange(29)))
+    assert len(falls) >= 5
+    assert (np.diff(store._trajectory[:30])[falls] == 1).all()
+
+
+def test_a_copy_of_the_recipe_leaves_the_recipe_alone() -> None:
+    recipe = HindsightRecipe(toy(), seed=0, learning_starts=100, batch_size=16).learn(200)
+    before = recipe.agent.predict(toy().reset(seed=3)[0])[0]
+    twin = recipe.copy(toy())
+    np.testing.assert_array_equal(twin.agent.predict(toy().reset(seed=3)[0])[0], before)
+    twin.learn(200)
+    assert twin.agent.store.total == 400 and not twin.agent.planning
+    assert recipe.agent.store.total == 200
+    np.testing.assert_array_equal(recipe.agent.predict(toy().reset(seed=3)[0])[0], before)
 
 
 class AnyStart(gym.Wrapper):

@@ -3,6 +3,6 @@
 from sb3_skillgraph.baselines.covering_options import CoveringOptions
 from sb3_skillgraph.baselines.goal_conditioned import GoalSchedule, OptionTask, make_her, make_uvfa
 from sb3_skillgraph.baselines.random_walk import RandomWalk
-from sb3_skillgraph.baselines.recipe import make_recipe
+from sb3_skillgraph.baselines.recipe import HindsightRecipe
 
-__all__ = ["CoveringOptions", "GoalSchedule", "OptionTask", "RandomWalk", "make_her", "make_recipe", "make_uvfa"]
+__all__ = ["CoveringOptions", "GoalSchedule", "HindsightRecipe", "OptionTask", "RandomWalk", "make_her", "make_uvfa"]

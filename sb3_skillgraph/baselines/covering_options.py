@@ -20,7 +20,7 @@ from sb3_skillgraph.options.initiation import InitiationSet
 from sb3_skillgraph.options.learner import OptionDDPG, OptionTD3
 from sb3_skillgraph.options.option import Option
 from sb3_skillgraph.options.views import ScaledView, as_view
-from sb3_skillgraph.replay import OptionReplay, TransitionStore
+from sb3_skillgraph.replay import OptionReplay, TransitionStore, as_rows
 from sb3_skillgraph.salience.dco import FiedlerEmbedding, learn_fiedler
 from sb3_skillgraph.smdp import FlatPolicy, OptionsEnv, SMDPQLearning
 from sb3_skillgraph.smdp.options_env import MOST_AXES
@@ -259,7 +259,7 @@ class CoveringOptions:
         """Learn from one environment step.
 
         :param transition: columns of the store, each of shape ``(1, dim)``
-        :param terminated: whether the environment ended for good
+        :param terminated: whether the environment ended for good, but not at the goal
         :param done: whether the episode ended
         :param stuck: whether it was given up since the agent was stuck
         """
@@ -324,18 +324,12 @@ class _Recorder(gym.Wrapper):
         action = action + self.learner.rng.normal(0.0, self.learner.exploration_noise, action.shape) * half
         action = np.clip(action, space.low, space.high).astype(space.dtype)
         observation, reward, terminated, truncated, info = self.env.step(action)
-        transition = {
-            "observation": self._last["observation"],
-            "achieved_goal": self._last["achieved_goal"],
-            "next_observation": observation["observation"],
-            "next_achieved_goal": observation["achieved_goal"],
-            "action": (action - space.low) / half - 1.0,
-            "goal": self._last["desired_goal"],
-        }
-        columns = {name: np.asarray(value).reshape(1, -1) for name, value in transition.items()}
+        transition = as_rows(self._last, (action - space.low) / half - 1.0, observation)
         self._last = observation
         stuck = bool(info.get("stuck"))  # OptionsEnv gives the episode up
-        self.learner.after_step(columns, terminated, terminated or truncated or stuck, stuck)
+        # An episode that ends at its own goal would have gone on for any other.
+        dead_end = terminated and not info.get("is_success")
+        self.learner.after_step(transition, dead_end, terminated or truncated or stuck, stuck)
         # Steps are environment steps: an option that runs when they are spent is cut off.
         return observation, reward, terminated, truncated or self.learner.model.budget.share_left <= 0.0, info
 

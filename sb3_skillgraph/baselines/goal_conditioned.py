@@ -130,33 +130,17 @@ def make_her(env: gym.Env, *, seed: int | None = None, **kwargs: Any) -> DDPG:
     :param kwargs: arguments of ``stable_baselines3.DDPG`` that differ from ``SETTINGS``
     """
     rule = goal_rule(float(env.get_wrapper_attr("success_radius")))
-    return _ddpg(OptionTask(env, rule), seed, {**hindsight(env, 1_000), **kwargs})
+    # HER samples complete episodes only, so that the first one must be over before learning starts.
+    first_episode = int(env.get_wrapper_attr("max_steps")) if env.has_wrapper_attr("max_steps") else 1_000
+    hindsight = dict(
+        replay_buffer_class=HerReplayBuffer,
+        replay_buffer_kwargs={"n_sampled_goal": 4, "copy_info_dict": True},
+        learning_starts=max(1_000, first_episode + 1),
+    )
+    return _ddpg(OptionTask(env, rule), seed, {**hindsight, **kwargs})
 
 
 def _ddpg(env: gym.Env, seed: int | None, kwargs: dict[str, Any]) -> DDPG:
-    return DDPG("MultiInputPolicy", env, action_noise=gaussian(env, 0.1), seed=seed, **{**SETTINGS, **kwargs})
-
-
-def hindsight(env: gym.Env, learning_starts: int) -> dict[str, Any]:
-    """Return the arguments that make an algorithm of SB3's learn in hindsight on an :class:`OptionTask`.
-
-    :param env: the environment
-    :param learning_starts: environment steps before learning, at least
-    """
-    # HER samples complete episodes only, so that the first one must be over before learning starts.
-    first_episode = int(env.get_wrapper_attr("max_steps")) if env.has_wrapper_attr("max_steps") else 1_000
-    return dict(
-        replay_buffer_class=HerReplayBuffer,
-        replay_buffer_kwargs={"n_sampled_goal": 4, "copy_info_dict": True},
-        learning_starts=max(learning_starts, first_episode + 1),
-    )
-
-
-def gaussian(env: gym.Env, sigma: float) -> NormalActionNoise:
-    """Return noise for an environment's actions.
-
-    :param env: the environment
-    :param sigma: standard deviation, in units of the scaled action
-    """
     assert env.action_space.shape is not None
-    return NormalActionNoise(np.zeros(env.action_space.shape), np.full(env.action_space.shape, sigma))
+    noise = NormalActionNoise(np.zeros(env.action_space.shape), np.full(env.action_space.shape, 0.1))
+    return DDPG("MultiInputPolicy", env, action_noise=noise, seed=seed, **{**SETTINGS, **kwargs})

@@ -1,63 +1,76 @@
-"""SB3's TD3 with HER on what an ant's options are given: so that the recipe is not mistaken for the graph."""
+"""Hindsight experience replay with all that the skill graph is given but the graph: so that neither passes for the other."""
 
+import copy
+from collections.abc import Callable
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
-import torch as th
-from gymnasium import spaces
-from stable_baselines3 import TD3
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 
-from sb3_skillgraph.baselines.goal_conditioned import OptionTask, gaussian, hindsight
-from sb3_skillgraph.options.option import goal_rule
-from sb3_skillgraph.options.views import ScaledView, as_view
+from sb3_skillgraph.agent import SkillGraphAgent
+from sb3_skillgraph.replay import as_rows
 
 
-class ViewExtractor(BaseFeaturesExtractor):
-    """Shows a policy of SB3's what an option's policy sees.
-
-    :param observation_space: of the goal environment
-    :param view: name of the view
-    :param radius: the unit of goal space
+class HindsightRecipe:
     """
+    The global option of a skill graph, learned by itself: TD3 or DDPG with hindsight, and a new goal every episode.
 
-    def __init__(self, observation_space: spaces.Dict, view: str, radius: float) -> None:
-        self.view = ScaledView(as_view(view), radius)
-        dims = [int(np.prod(observation_space[key].shape)) for key in ("observation", "achieved_goal")]  # type: ignore[arg-type]
-        super().__init__(observation_space, self.view.dim(*dims))
-
-    def forward(self, observations: dict[str, th.Tensor]) -> th.Tensor:
-        """Return what is seen, shape ``(n, features_dim)``.
-
-        :param observations: batches by name
-        """
-        parts = [observations[key].cpu().numpy() for key in ("observation", "achieved_goal", "desired_goal")]
-        return th.from_numpy(self.view(*parts)).to(observations["observation"].device)
-
-
-def make_recipe(env: gym.Env, *, seed: int | None = None, shaping: float = 0.0, **kwargs: Any) -> TD3:
-    """Build TD3 with hindsight experience replay that sees, is paid and explores as the ant's options do.
+    It sees, is paid and learns from minibatches (no goal is put in shortly before a fall) as the options of a
+    :class:`~sb3_skillgraph.SkillGraphAgent` with the same arguments, and all of that agent's updates go to it. Goals are the
+    environment's, exploration is Gaussian noise, and there are no events, no plans and no ways remembered.
 
     :param env: a goal environment whose episodes end at the goal
+    :param exploration_noise: standard deviation of the noise on scaled actions
     :param seed: of everything random
-    :param shaping: reward for every success radius of distance gained
-    :param kwargs: arguments of ``stable_baselines3.TD3`` that differ from those below
+    :param kwargs: further arguments of :class:`~sb3_skillgraph.SkillGraphAgent`; those of the graph have no effect
     """
-    radius = float(env.get_wrapper_attr("success_radius"))
-    settings: dict[str, Any] = dict(
-        learning_rate=1e-3,
-        batch_size=256,
-        tau=0.005,
-        gamma=0.99,
-        train_freq=(1, "step"),
-        gradient_steps=1,
-        policy_kwargs={
-            "net_arch": [128, 128],
-            "features_extractor_class": ViewExtractor,
-            "features_extractor_kwargs": {"view": env.get_wrapper_attr("option_view"), "radius": radius},
-        },
-    )
-    settings.update(hindsight(env, 2_500) | kwargs)
-    rule = goal_rule(radius, settings["gamma"], shaping / radius)
-    return TD3("MultiInputPolicy", OptionTask(env, rule), action_noise=gaussian(env, 0.2), seed=seed, **settings)
+
+    def __init__(self, env: gym.Env, *, exploration_noise: float = 0.1, seed: int | None = None, **kwargs: Any) -> None:
+        self.env = env
+        self.exploration_noise = exploration_noise
+        self.agent = SkillGraphAgent(**{"policy": "MultiInputPolicy", **kwargs}, env=env, seed=seed)
+        self.agent.planning = False
+
+    def learn(self, total_timesteps: int, on_step: Callable[[int], None] | None = None) -> "HindsightRecipe":
+        """Learn.
+
+        :param total_timesteps: environment steps
+        :param on_step: called after every environment step with their number
+        :return: itself
+        """
+        agent, store = self.agent, self.agent.store
+        learner, every = agent.global_option.learner, agent.train_freq.frequency  # type: ignore[union-attr]
+        store.cut()
+        observation, _ = self.env.reset(seed=agent.seed if store.total == 0 else None)
+        for _ in range(total_timesteps):
+            scaled = self._explore(observation)
+            after, _, terminated, truncated, info = self.env.step(learner.policy.unscale_action(scaled))
+            stuck = bool(info.get("stuck"))
+            over = terminated or truncated or stuck
+            # An episode that ends at its own goal would have gone on for any other.
+            ends = dict(terminated=terminated and not info.get("is_success"), done=over, stuck=stuck)
+            store.add(**as_rows(observation, scaled, after), **{name: np.array([end]) for name, end in ends.items()})
+            observation = self.env.reset()[0] if over else after
+            if store.total >= agent.learning_starts and store.total % every == 0:
+                learner.train(agent.gradient_steps, agent.batch_size)
+            if on_step is not None:
+                on_step(store.total)
+        return self
+
+    def _explore(self, observation: dict[str, np.ndarray]) -> np.ndarray:
+        """Return an action in [-1, 1], shape ``(action_dim,)``: a random one at first, then the policy's with noise."""
+        rng, policy = self.agent.rng, self.agent.global_option.learner.policy
+        if self.agent.store.total < self.agent.learning_starts:
+            return rng.uniform(-1.0, 1.0, policy.action_space.shape)
+        scaled = policy.scale_action(self.agent.predict(observation)[0])
+        return np.clip(scaled + rng.normal(0.0, self.exploration_noise, scaled.shape), -1.0, 1.0)
+
+    def copy(self, env: gym.Env) -> "HindsightRecipe":
+        """Return a copy that knows the same.
+
+        :param env: the environment that it goes on in
+        """
+        twin = copy.copy(self)
+        twin.env, twin.agent = env, self.agent.copy(env)
+        twin.agent.planning = False
+        return twin

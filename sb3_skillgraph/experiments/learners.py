@@ -14,7 +14,7 @@ from stable_baselines3 import TD3
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_skillgraph.agent import SkillGraphAgent
-from sb3_skillgraph.baselines import CoveringOptions, OptionTask, RandomWalk, make_her, make_recipe, make_uvfa
+from sb3_skillgraph.baselines import CoveringOptions, HindsightRecipe, OptionTask, RandomWalk, make_her, make_uvfa
 from sb3_skillgraph.evaluation import Predictor
 from sb3_skillgraph.hyperparams import check_hyperparams, load_hyperparams
 from sb3_skillgraph.options.learner import OptionDDPG, OptionTD3
@@ -93,16 +93,21 @@ def load_agent(folder: Path, env: gym.Env) -> SkillGraphAgent:
     return agent
 
 
+def _recommended(env_id: str, arguments: dict[str, Any]) -> dict[str, Any]:
+    """Return arguments of a skill graph: what is recommended for an environment, but for what is given."""
+    recommended = {**load_hyperparams(env_id), **check_hyperparams(arguments, "arguments")}
+    del recommended["n_timesteps"]
+    return recommended
+
+
 class SkillGraphLearner(Learner):
     """Deep Skill Graphs; episodes do not end at goals, and there is no reward."""
 
     resumable = True
 
     def __init__(self, env_id: str, env_kwargs: dict[str, Any], seed: int, arguments: dict[str, Any]) -> None:
-        recommended = {**load_hyperparams(env_id), **check_hyperparams(arguments, "arguments")}
-        del recommended["n_timesteps"]
         self.env = gym.make(env_id, **env_kwargs)
-        self.policy: SkillGraphAgent = SkillGraphAgent(env=self.env, seed=seed, **recommended)
+        self.policy: SkillGraphAgent = SkillGraphAgent(env=self.env, seed=seed, **_recommended(env_id, arguments))
 
     def learn(self, begin: int, end: int, every: int, check: Check) -> None:
         """Learn from check to check: between two calls of ``learn`` an agent can be saved exactly."""
@@ -143,16 +148,23 @@ class SkillGraphLearner(Learner):
         }
 
 
+def _checking(every: int, end: int, check: Check) -> Check:
+    """Return what checks every so often, but not at the end, when it is called after every step."""
+
+    def on_step(n_steps: int) -> None:
+        if n_steps % every == 0 and n_steps < end:
+            check(n_steps)
+
+    return on_step
+
+
 class _Checks(BaseCallback):
-    def __init__(self, every: int, end: int, check: Check) -> None:
+    def __init__(self, checking: Check) -> None:
         super().__init__()
-        self.every = every
-        self.end = end
-        self.check = check
+        self.checking = checking
 
     def _on_step(self) -> bool:
-        if self.num_timesteps % self.every == 0 and self.num_timesteps < self.end:
-            self.check(self.num_timesteps)
+        self.checking(self.num_timesteps)
         return True
 
 
@@ -167,7 +179,7 @@ class GoalConditionedLearner(Learner):
 
     def learn(self, begin: int, end: int, every: int, check: Check) -> None:
         """Learn in one go."""
-        self.policy.learn(end, callback=_Checks(every, end, check), log_interval=1_000_000)
+        self.policy.learn(end, callback=_Checks(_checking(every, end, check)), log_interval=1_000_000)
         check(end)
 
     def practise(self, env: gym.Env, start: np.ndarray, goal: np.ndarray, stretches: list[int]) -> Iterator[Predictor]:
@@ -196,7 +208,7 @@ class UVFALearner(GoalConditionedLearner):
 class HERLearner(GoalConditionedLearner):
     """A new goal every episode, and in hindsight."""
 
-    make: Callable[..., TD3] = staticmethod(make_her)
+    make = staticmethod(make_her)
 
     def practise(self, env: gym.Env, start: np.ndarray, goal: np.ndarray, stretches: list[int]) -> Iterator[Predictor]:
         """Let a copy go on learning, paid as before."""
@@ -204,10 +216,26 @@ class HERLearner(GoalConditionedLearner):
         yield from super().practise(OptionTask(env, rule), start, goal, stretches)
 
 
-class RecipeLearner(HERLearner):
-    """TD3 with hindsight on what an ant's options are given."""
+class RecipeLearner(Learner):
+    """The skill graph's global option, learned by itself."""
 
-    make = staticmethod(make_recipe)
+    def __init__(self, env_id: str, env_kwargs: dict[str, Any], seed: int, arguments: dict[str, Any]) -> None:
+        env = gym.make(env_id, **{"terminate_on_success": True, **env_kwargs})
+        self.recipe = HindsightRecipe(env, seed=seed, **_recommended(env_id, arguments))
+        self.policy: SkillGraphAgent = self.recipe.agent
+
+    def learn(self, begin: int, end: int, every: int, check: Check) -> None:
+        """Learn in one go."""
+        self.recipe.learn(end, _checking(every, end, check))
+        check(end)
+
+    def practise(self, env: gym.Env, start: np.ndarray, goal: np.ndarray, stretches: list[int]) -> Iterator[Predictor]:
+        """Let a copy go on learning."""
+        twin = self.recipe.copy(env)
+        yield twin.agent
+        for n_steps in stretches:
+            twin.learn(n_steps)
+            yield twin.agent
 
 
 class CoveringOptionsLearner(Learner):
@@ -223,12 +251,7 @@ class CoveringOptionsLearner(Learner):
 
     def learn(self, begin: int, end: int, every: int, check: Check) -> None:
         """Learn in one go."""
-
-        def on_step(n_steps: int) -> None:
-            if n_steps % every == 0 and n_steps < end:
-                check(n_steps)
-
-        self.policy.learn(end, on_step)
+        self.policy.learn(end, _checking(every, end, check))
         check(end)
 
     def practise(self, env: gym.Env, start: np.ndarray, goal: np.ndarray, stretches: list[int]) -> Iterator[Predictor]:
