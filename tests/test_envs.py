@@ -28,6 +28,9 @@ IDS = [
     "SkillGraph/PointMaze-v0",
     ANT,
     "SkillGraph/AntReacher-v0",
+    "SkillGraph/AntMedium-v0",
+    "SkillGraph/AntLarge-v0",
+    "SkillGraph/AntMaze-v0",
 ]
 CAR = "car"  # the point maze with the paper's robot
 BODIES = [TOY, POINT, CAR, ANT]
@@ -54,7 +57,7 @@ GEOMETRIES = {name: envs.MazeGeometry(maze_map) for name, maze_map in MAZES.item
 def make(env_id: str, **kwargs: Any) -> gym.Env:
     if env_id == CAR:
         return gym.make(POINT, robot="car", **kwargs)
-    if env_id.endswith("PointMaze-v0"):
+    if env_id.endswith(("PointMaze-v0", "AntMaze-v0")):
         kwargs.setdefault("maze_map", ODD_MAZE)
     return gym.make(env_id, **kwargs)
 

@@ -31,6 +31,9 @@ _TASKS: dict[str, tuple[str, dict[str, Any]]] = {
     "SkillGraph/PointMaze-v0": (_POINT, {}),
     "SkillGraph/AntUMaze-v0": (_ANT, {"maze_map": U_MAZE}),
     "SkillGraph/AntReacher-v0": (_ANT, {"maze_map": OPEN_AREA}),
+    "SkillGraph/AntMedium-v0": (_ANT, {"maze_map": MEDIUM_MAZE}),
+    "SkillGraph/AntLarge-v0": (_ANT, {"maze_map": LARGE_MAZE}),
+    "SkillGraph/AntMaze-v0": (_ANT, {}),
     "SkillGraph/ToyMaze-v0": (_TOY, {}),
 }
 
