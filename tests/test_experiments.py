@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -355,6 +356,16 @@ def test_what_cannot_be_drawn(
     command = [*words[:2], str(runs[0]), *words[2:], "--out", str(runs[1]), "--to", str(tmp_path / "x.png")]
     assert main(command) == 2
     assert message in capsys.readouterr().err
+
+
+def test_stored_results_without_agents_say_so(
+    runs: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copytree(runs[1], tmp_path / "results", ignore=shutil.ignore_patterns("checkpoint_*"))
+    command = [str(runs[0]), "--out", str(tmp_path / "results"), "--to", str(tmp_path / "x.png")]
+    assert main(["figure", "6", *command]) == 0
+    assert main(["figure", "3", *command]) == 2
+    assert "no finished run of a skill graph" in capsys.readouterr().err
 
 
 def test_compare_and_status_on_the_command_line(runs: tuple[Path, Path], capsys: pytest.CaptureFixture[str]) -> None:

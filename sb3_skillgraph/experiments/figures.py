@@ -53,8 +53,8 @@ def redraw(number: int, specs: Sequence[RunSpec], out: Path) -> Axes:
 # -- reading runs -----------------------------------------------------------------------------------------------------
 
 
-def _finished(specs: Sequence[RunSpec], out: Path, salience: str | None = None) -> list[RunSpec]:
-    """Find the finished runs of skill graphs, at least one."""
+def _finished(specs: Sequence[RunSpec], out: Path, salience: str | None = None, with_agent: bool = True) -> list[RunSpec]:
+    """Find the finished runs of skill graphs, at least one; those whose checkpoint is still there, if it is needed."""
     found = [
         spec
         for spec in specs
@@ -62,10 +62,13 @@ def _finished(specs: Sequence[RunSpec], out: Path, salience: str | None = None) 
         and (salience is None or spec.arguments.get("salience", "frontier") == salience)
         and (spec.folder(out) / DONE).exists()
     ]
+    kind = "of a skill graph" if salience is None else f"of a skill graph with salience={salience}"
     if not found:
-        kind = "of a skill graph" if salience is None else f"of a skill graph with salience={salience}"
         raise MissingRunError(f"This figure needs a finished run {kind}, and {out} has none.")
-    return found
+    usable = [spec for spec in found if not with_agent or checkpoints(spec.folder(out))]
+    if not usable:
+        raise MissingRunError(f"This figure needs the agent, and no finished run {kind} in {out} has a checkpoint any more.")
+    return usable
 
 
 def _name(spec: RunSpec) -> str:
@@ -74,8 +77,6 @@ def _name(spec: RunSpec) -> str:
 
 def _agent(spec: RunSpec, out: Path) -> SkillGraphAgent:
     saved = checkpoints(spec.folder(out))
-    if not saved:
-        raise MissingRunError(f"{spec.folder(out)} has no checkpoint any more.")
     return load_agent(saved[max(saved)], gym.make(spec.env_id, **spec.env_kwargs))
 
 
@@ -212,7 +213,7 @@ def practice_curves(specs: Sequence[RunSpec], out: Path) -> dict[str, draw.Curve
 
 def growth(specs: Sequence[RunSpec], out: Path) -> Axes:
     """Figure 6: the graph as it grows."""
-    spec = _finished(specs, out)[0]
+    spec = _finished(specs, out, with_agent=False)[0]
     geometry = _geometry(spec)
     snapshots = [
         draw.GraphSnapshot(plain["steps"], np.array(plain["centers"]), [tuple(link) for link in plain["links"]])
