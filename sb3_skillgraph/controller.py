@@ -289,7 +289,7 @@ class Controller:
             return self._practise(point, request, failures, avoid)
         if request.event is not None:
             return self._towards(point, request.event, failures, avoid)
-        if retracing and self.planner.near_in_steps(point, request.goal):
+        if retracing and self.planner.retraceable(point, request.goal):
             return self._retrace(point, request.goal, -1, failures)  # do not turn back half-way
         return self._to_goal(point, request.goal, failures, avoid)
 
@@ -311,14 +311,21 @@ class Controller:
         return self._walk_to(point, entry, failures)
 
     def _to_goal(self, point: np.ndarray, goal: np.ndarray, failures: int, avoid: Collection[str]) -> tuple[int, int]:
-        """Follow the cheapest way to a goal; after a failed approach, the next cheapest."""
+        """Follow the cheapest way to a goal; after a failed approach the next cheapest, then go straight, then begin anew."""
         legs = self.planner.legs(point, goal, avoid)
-        if legs:
-            path = legs[min(failures, len(legs) - 1)].path
-            return self._retrace(point, goal, -1, failures) if path is None else (self.index(self._first(path)), -1)
-        nearest = self.planner.vertices_near(goal)
-        entry = self.planner.entry(point, nearest[0][0].id) if nearest else None
-        return self._retrace(point, goal, -1, failures) if entry is None else self._walk_to(point, entry, failures)
+        n_ways = max(len(legs), 2)  # without legs: to enter the graph, and to retrace what comes near
+        turn = failures % (n_ways + 1)
+        if turn == n_ways:
+            return GLOBAL, -1
+        if turn < len(legs):
+            path = legs[turn].path
+            if path is not None:
+                return self.index(self._first(path)), -1
+        elif turn == 0 and (nearest := self.planner.vertices_near(goal)):
+            entry = self.planner.entry(point, nearest[0][0].id)
+            if entry is not None:
+                return self._walk_to(point, entry, failures)
+        return self._retrace(point, goal, -1, failures)
 
     def _first(self, path: GraphPath) -> Option:
         return self.chaining.options[path.vertices[0]]

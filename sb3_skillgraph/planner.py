@@ -1,5 +1,6 @@
 """Planning over the skill graph: to an event, and to a goal the agent never saw (sections 3.2.3, 3.2.4, 3.3)."""
 
+import math
 from collections.abc import Callable, Collection
 from typing import Literal, NamedTuple
 
@@ -64,6 +65,8 @@ class GraphPlanner:
         self.radius = radius
         self.reach = reach
         self.nearest = nearest
+        # Of a trajectory to be followed: from where one stands it can be reached; but it must end at the goal.
+        self._passing = (radius, 0.5 * radius)
 
     def event_at(self, point: np.ndarray) -> SalientEvent | None:
         """Return the event a point lies in (the nearest, if several)."""
@@ -115,7 +118,7 @@ class GraphPlanner:
         """
         unit = self.reach if self.nearest == "steps" else 2.0 * self.radius
         legs = []
-        steps = self.visited.steps_between(point, goal, 0.5 * self.radius)
+        steps = self.visited.steps_between(point, goal, self._passing)
         if np.isfinite(steps) and self.nearest == "steps":
             # Beyond the reach of one option, plans are surer than a long way retraced.
             legs.append(Leg(None, None, steps / self.reach * (1.0 if steps <= self.reach else RETRACING)))
@@ -139,7 +142,7 @@ class GraphPlanner:
         """
         if self.nearest == "euclidean":
             return -1
-        return self.visited.waypoint(point, goal, 0.5 * self.radius, self.reach // (6 if failures else 3))
+        return self.visited.waypoint(point, goal, self._passing, self.reach // (6 if failures else 3))
 
     def route(self, point: np.ndarray, goal: np.ndarray) -> np.ndarray:
         """Return where the global option should go first on its way to a goal (see :meth:`waypoint`).
@@ -151,9 +154,10 @@ class GraphPlanner:
         waypoint = self.waypoint(point, goal, 0)
         return goal if waypoint < 0 else self.visited.point(waypoint)
 
-    def near_in_steps(self, point: np.ndarray, goal: np.ndarray) -> bool:
-        """Tell whether a trajectory went from a point to another in no more steps than three options take."""
-        return self.visited.steps_between(point, goal, 0.5 * self.radius) <= 3 * self.reach
+    def retraceable(self, point: np.ndarray, goal: np.ndarray) -> bool:
+        """Tell whether a trajectory went from near one point to near another, or came from there."""
+        ways = (self.visited.steps_between(*ends, self._passing) for ends in ((point, goal), (goal, point)))
+        return any(map(math.isfinite, ways))
 
     def entry(self, point: np.ndarray, target: str | None) -> SalientEvent | None:
         """Return the event by which to enter the graph from a point outside.

@@ -246,35 +246,41 @@ class VisitedStates:
         _, _, event, steps = self._events_passed(without)
         return _fewest(event, steps, self.near(point, radius))
 
-    def steps_between(self, start: np.ndarray, goal: np.ndarray, radius: float) -> float:
+    def steps_between(self, start: np.ndarray, goal: np.ndarray, radii: tuple[float, float]) -> float:
         """Return the fewest steps any trajectory took from near one point to near another.
 
         :param start: shape ``(goal_dim,)``
         :param goal: shape ``(goal_dim,)``
-        :param radius: how near a trajectory must come, in goal units
+        :param radii: how near a trajectory must come to the start, and how near to the goal, in goal units
         :return: environment steps; ``inf`` if no trajectory passed both in this order
         """
-        here, there = self.near(start, radius, exact=True), self.near(goal, radius, exact=True)
-        departure, arrival = self._passage(here, there)
+        departure, arrival = self._passage(self.near(start, radii[0], exact=True), self.near(goal, radii[1], exact=True))
         return float("inf") if departure < 0 else float(self._step[arrival] - self._step[departure])
 
-    def waypoint(self, start: np.ndarray, goal: np.ndarray, radius: float, ahead: int) -> int:
+    def waypoint(self, start: np.ndarray, goal: np.ndarray, radii: tuple[float, float], ahead: int) -> int:
         """Find the next point to walk to on the quickest way any trajectory took from near one point to near another.
+
+        If none did, but one came the other way, that one is followed backwards.
 
         :param start: shape ``(goal_dim,)``
         :param goal: shape ``(goal_dim,)``
-        :param radius: how near a trajectory must come, and how far the waypoint must be from the start at least
+        :param radii: how near a trajectory must come to the start, and how near to the goal; the waypoint must be further
+            from the start than the latter
         :param ahead: environment steps the trajectory took to the waypoint at least
         :return: number of a visited point (see :meth:`point`); ``-1`` if the goal itself is as near, or no trajectory
             leads there
         """
-        departure, arrival = self._passage(self.near(start, radius), self.near(goal, radius))
+        here, there = self.near(start, radii[0]), self.near(goal, radii[1])
+        departure, arrival = self._passage(here, there)
+        step, trajectory = self._step[: self.size], self._trajectory[: self.size]
+        if departure < 0:
+            arrival, departure = self._passage(there, here)
+            step = -step
         if departure < 0:
             return -1
-        step, trajectory = self._step[: self.size], self._trajectory[: self.size]
         way = (trajectory == trajectory[departure]) & (step >= step[departure] + ahead) & (step < step[arrival])
         indices = np.flatnonzero(way)
-        far = np.linalg.norm(self.points[indices] - start, axis=1) > radius
+        far = np.linalg.norm(self.points[indices] - start, axis=1) > radii[1]
         indices = indices[far]
         return self.n_forgotten + int(indices[step[indices].argmin()]) if len(indices) else -1
 

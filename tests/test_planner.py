@@ -175,7 +175,7 @@ def test_a_long_way_retraced_costs_more_than_a_short_one() -> None:
     world = World(reach=20)
     world.walk((0, 0), (30, 0), 60)
     for x in (2.0, 9.0, 10.5, 15.0, 29.0):
-        steps = world.visited.steps_between(at(0.0), at(x), 0.5)
+        steps = world.visited.steps_between(at(0.0), at(x), (1.0, 0.5))
         [leg] = world.planner.legs(at(0.0), at(x))
         assert (leg.event, leg.path) == (None, None)
         assert leg.cost == pytest.approx(steps / 20 * (1.0 if steps <= 20 else RETRACING))

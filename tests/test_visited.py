@@ -18,6 +18,7 @@ moves = st.lists(
     max_size=60,
 )
 points = st.tuples(st.integers(-8, 8), st.integers(-8, 8)).map(lambda p: np.array(p) * 0.5)
+radii = st.tuples(st.sampled_from([0.0, 0.6, 1.5]), st.sampled_from([0.0, 0.6, 1.5]))
 CENTERS, RADII = np.array([[0.0, 0.0], [3.0, 0.5], [-3.0, -2.5], [3.5, 0.5]]), np.array([1.0, 1.5, 1.0, 1.0])
 
 
@@ -55,8 +56,8 @@ class Oracle:
                 fewest[found[0]] = min(found[1], fewest.get(found[0], 10**9))
         return fewest
 
-    def steps_between(self, start: np.ndarray, goal: np.ndarray, radius: float) -> float:
-        here, there = self.near(start, radius), self.near(goal, radius)
+    def steps_between(self, start: np.ndarray, goal: np.ndarray, radii: tuple[float, float]) -> float:
+        here, there = self.near(start, radii[0]), self.near(goal, radii[1])
         steps = [
             self.kept[j][1] - self.kept[i][1]
             for i in here
@@ -106,37 +107,37 @@ def test_events_before_and_after_agree_with_brute_force(sequence: list[Move], po
         assert list(answer.values()) == sorted(answer.values())  # fewest first
 
 
-@given(moves, points, points, st.sampled_from([0.0, 0.6, 1.5]))
+@given(moves, points, points, radii)
 @profile(80)
 def test_steps_between_agrees_with_brute_force(
-    sequence: list[Move], start: np.ndarray, goal: np.ndarray, radius: float
+    sequence: list[Move], start: np.ndarray, goal: np.ndarray, radii: tuple[float, float]
 ) -> None:
     visited = VisitedStates(2, SPACING, n_envs=3)
     oracle = record_all(visited, sequence)
     start, goal = (visited.points[np.linalg.norm(visited.points - end, axis=1).argmin()] for end in (start, goal))
-    assert visited.steps_between(start, goal, radius) == oracle.steps_between(start, goal, radius)
+    assert visited.steps_between(start, goal, radii) == oracle.steps_between(start, goal, radii)
 
 
-@given(moves, points, points, st.sampled_from([0.0, 0.6, 1.5]), st.integers(0, 6))
+@given(moves, points, points, radii, st.integers(0, 6))
 @profile(120)
 def test_a_waypoint_lies_ahead_on_the_quickest_way(
-    sequence: list[Move], start: np.ndarray, goal: np.ndarray, radius: float, ahead: int
+    sequence: list[Move], start: np.ndarray, goal: np.ndarray, radii: tuple[float, float], ahead: int
 ) -> None:
+    """Forwards in time if any trajectory went that way, else backwards."""
     visited = VisitedStates(2, SPACING, n_envs=3)
     kept = (oracle := record_all(visited, sequence)).kept
-    quickest = oracle.steps_between(start, goal, radius)
-    passages = [
-        (i, j)
-        for i in oracle.near(start, radius)
-        for j in oracle.near(goal, radius)
-        if kept[i][0] == kept[j][0] and kept[j][1] - kept[i][1] == quickest
-    ]
+    here, there = oracle.near(start, radii[0]), oracle.near(goal, radii[1])
+    same = [(i, j) for i in here for j in there if kept[i][0] == kept[j][0]]
+    forwards = [(i, j) for i, j in same if kept[j][1] >= kept[i][1]]
+    time = 1 if forwards else -1
+    steps = {(i, j): time * (kept[j][1] - kept[i][1]) for i, j in forwards or same}
     allowed = set()
-    for i, j in passages:
-        between = [k for k in range(len(kept)) if kept[k][0] == kept[i][0] and kept[i][1] + ahead <= kept[k][1] < kept[j][1]]
-        between = [k for k in between if np.linalg.norm(kept[k][2] - start) > radius]
-        allowed.add(min(between, key=lambda k: kept[k][1], default=-1))
-    assert visited.waypoint(start, goal, radius, ahead) in (allowed or {-1})
+    for i, j in (passage for passage, n in steps.items() if n == min(steps.values())):
+        after = {k: time * (kept[k][1] - kept[i][1]) for k in range(len(kept)) if kept[k][0] == kept[i][0]}
+        between = [k for k, n in after.items() if ahead <= n < steps[i, j]]
+        between = [k for k in between if np.linalg.norm(kept[k][2] - start) > radii[1]]
+        allowed.add(min(between, key=after.__getitem__, default=-1))
+    assert visited.waypoint(start, goal, radii, ahead) in (allowed or {-1})
 
 
 def test_waypoints_lead_around_a_corner_to_the_goal() -> None:
@@ -145,13 +146,15 @@ def test_waypoints_lead_around_a_corner_to_the_goal() -> None:
     for step, point in enumerate(corridor):
         visited.record(0, step, np.array(point, dtype=np.float32))
     at, goal, passed = np.array([0.4, 0.3]), np.array([10.0, 10.0]), []
-    while (k := visited.waypoint(at, goal, 0.5, 4)) >= 0:
+    while (k := visited.waypoint(at, goal, (0.5, 0.5), 4)) >= 0:
         passed.append(k)
         at = visited.points[k].astype(np.float64)
     assert passed == [4, 8, 12, 16]
-    assert visited.waypoint(np.array([10.0, 7.0]), goal, 0.5, 4) == -1  # the goal is as near
-    assert visited.waypoint(goal, np.zeros(2), 0.5, 4) == -1  # nobody went back
-    assert visited.waypoint(np.array([-50.0, 0.0]), goal, 0.5, 4) == 4  # from afar: by where the way begins
+    assert visited.waypoint(np.array([10.0, 7.0]), goal, (0.5, 0.5), 4) == -1  # the goal is as near
+    assert visited.waypoint(np.array([-50.0, 0.0]), goal, (0.5, 0.5), 4) == 4  # from afar: by where the way begins
+    assert visited.waypoint(goal, np.zeros(2), (0.5, 0.5), 4) == 16  # nobody went back: backwards by the way that came
+    assert visited.waypoint(np.array([6.0, 1.2]), goal, (0.5, 0.5), 4) == 10  # not near any way: by the nearest point of one
+    assert visited.waypoint(np.array([6.0, 1.2]), goal, (2.0, 0.5), 4) == 11  # near one: on from where it is furthest ahead
 
 
 def test_near_is_the_nearest_point_unless_exact() -> None:
@@ -167,7 +170,7 @@ def test_near_is_the_nearest_point_unless_exact() -> None:
 def test_no_steps_between_places_that_no_trajectory_came_near(start: float, goal: float) -> None:
     visited = VisitedStates(2, SPACING)
     straight(visited, 5)
-    assert visited.steps_between(np.array([start, 0.0]), np.array([goal, 0.0]), 0.5) == np.inf
+    assert visited.steps_between(np.array([start, 0.0]), np.array([goal, 0.0]), (0.5, 0.5)) == np.inf
 
 
 @given(moves, points, st.sampled_from([0.6, 1.5]))
@@ -256,8 +259,8 @@ def test_nothing_visited() -> None:
     assert visited.near(np.zeros(2), 5.0).size == 0
     assert visited.events_before(np.zeros(2), 5.0) == {}
     assert visited.events_after(np.zeros(2), 5.0) == {}
-    assert visited.steps_between(np.zeros(2), np.ones(2), 5.0) == np.inf
-    assert visited.waypoint(np.zeros(2), np.ones(2), 5.0, 3) == -1
+    assert visited.steps_between(np.zeros(2), np.ones(2), (5.0, 5.0)) == np.inf
+    assert visited.waypoint(np.zeros(2), np.ones(2), (5.0, 5.0), 3) == -1
 
 
 def straight(visited: VisitedStates, n: int, start: int = 0, y: float = 0.0) -> None:
@@ -302,7 +305,7 @@ def test_cut_ends_every_trajectory() -> None:
     visited.record(1, 6, np.array([6.0, 0.0], dtype=np.float32))
     assert visited.events_before(np.array([4.0, 0.0]), 0.1) == {0: 4}
     assert visited.events_before(np.array([5.0, 0.0]), 0.1) == {}
-    assert visited.steps_between(np.array([5.0, 0.0]), np.array([6.0, 0.0]), 0.1) == np.inf
+    assert visited.steps_between(np.array([5.0, 0.0]), np.array([6.0, 0.0]), (0.1, 0.1)) == np.inf
 
 
 def test_the_end_of_an_episode_is_kept_however_near() -> None:
@@ -312,7 +315,7 @@ def test_the_end_of_an_episode_is_kept_however_near() -> None:
     visited.record(0, 2, np.full(2, 0.2, dtype=np.float32), done=True)
     visited.record(0, 3, np.full(2, 0.2, dtype=np.float32))
     np.testing.assert_allclose(visited.points[:, 0], [0.0, 0.2, 0.2])
-    assert visited.steps_between(np.zeros(2), np.full(2, 0.2), 0.05) == 2
+    assert visited.steps_between(np.zeros(2), np.full(2, 0.2), (0.05, 0.05)) == 2
 
 
 @pytest.mark.parametrize("n_first", [0, 25])
