@@ -2,6 +2,7 @@
 
 import copy
 import time
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -91,19 +92,22 @@ class Rollouts(Assembly):
         observation = {key: rows(self._last_obs, key) for key in ("observation", "achieved_goal")}
         requests = [mission.request for mission in self.curriculum.missions]
         scaled, aims, state = self.controller.act(observation, self._state, requests)
-        scaled, held, hold_left = self._explore(scaled, action_noise)
+        random_walks = [mission.random_walk for mission in self.curriculum.missions]
+        scaled, held, hold_left = self._explore(scaled, random_walks, action_noise)
         self._pending = _Pending(observation, requests, scaled, aims, state, held, hold_left, rng_state)
         return self._factory.unscale(scaled).reshape((n_envs, *self._action_space().shape)), scaled
 
-    def _explore(self, scaled: np.ndarray, action_noise: ActionNoise | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _explore(
+        self, scaled: np.ndarray, random_walks: Sequence[bool], action_noise: ActionNoise | None = None
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Add noise, or replace an action by a random one that is held for some steps."""
         if action_noise is not None:
             scaled = scaled + action_noise()
         elif self._exploration_noise:
             scaled = scaled + self.rng.normal(0.0, self._exploration_noise, scaled.shape)
         held, hold_left = self._held_actions, self._hold_left.copy()
-        for i, mission in enumerate(self.curriculum.missions):
-            if hold_left[i] == 0 and (mission.random_walk or self.rng.random() < self._random_action_prob / self._random_hold):
+        for i, random_walk in enumerate(random_walks):
+            if hold_left[i] == 0 and (random_walk or self.rng.random() < self._random_action_prob / self._random_hold):
                 held = held.copy()
                 held[i] = self.rng.uniform(-1.0, 1.0, held[i].shape)
                 hold_left[i] = self.rng.integers(1, 2 * self._random_hold)

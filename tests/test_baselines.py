@@ -80,10 +80,11 @@ def test_a_baseline_is_paid_as_options_are_paid() -> None:
 
 def test_the_recipe_learns_without_a_graph() -> None:
     seen: list[int] = []
-    recipe = HindsightRecipe(toy(), seed=0, learning_starts=300, batch_size=64).learn(2_000, seen.append)
+    recipe = HindsightRecipe(toy(), seed=0, learning_starts=300, batch_size=64).learn(4_000, seen.append)
     agent = recipe.agent
-    assert seen == list(range(1, 2_001)) and agent.store.total == 2_000
-    assert agent.global_option.learner._n_updates == (2_000 - 300) // 2 + 1
+    assert seen == list(range(1, 4_001))
+    assert agent.store.total == 4_000
+    assert agent.global_option.learner._n_updates == (4_000 - 300) // 2 + 1
     assert not agent.planning and not agent.events
     assert evaluate_pairs(agent, TOY, n_pairs=30).success_rate >= 0.4
 

@@ -16,18 +16,16 @@ class HindsightRecipe:
     The global option of a skill graph, learned by itself: TD3 or DDPG with hindsight, and a new goal every episode.
 
     It sees, is paid and learns from minibatches (no goal is put in shortly before a fall) as the options of a
-    :class:`~sb3_skillgraph.SkillGraphAgent` with the same arguments, and all of that agent's updates go to it. Goals are the
-    environment's, exploration is Gaussian noise, and there are no events, no plans and no ways remembered.
+    :class:`~sb3_skillgraph.SkillGraphAgent` with the same arguments, under the same noise, and all of that agent's updates go
+    to it. Goals are the environment's, and there are no events, no plans and no ways remembered.
 
     :param env: a goal environment whose episodes end at the goal
-    :param exploration_noise: standard deviation of the noise on scaled actions
     :param seed: of everything random
     :param kwargs: further arguments of :class:`~sb3_skillgraph.SkillGraphAgent`; those of the graph have no effect
     """
 
-    def __init__(self, env: gym.Env, *, exploration_noise: float = 0.1, seed: int | None = None, **kwargs: Any) -> None:
+    def __init__(self, env: gym.Env, *, seed: int | None = None, **kwargs: Any) -> None:
         self.env = env
-        self.exploration_noise = exploration_noise
         self.agent = SkillGraphAgent(**{"policy": "MultiInputPolicy", **kwargs}, env=env, seed=seed)
         self.agent.planning = False
 
@@ -59,11 +57,11 @@ class HindsightRecipe:
 
     def _explore(self, observation: dict[str, np.ndarray]) -> np.ndarray:
         """Return an action in [-1, 1], shape ``(action_dim,)``: a random one at first, then the policy's with noise."""
-        rng, policy = self.agent.rng, self.agent.global_option.learner.policy
-        if self.agent.store.total < self.agent.learning_starts:
-            return rng.uniform(-1.0, 1.0, policy.action_space.shape)
-        scaled = policy.scale_action(self.agent.predict(observation)[0])
-        return np.clip(scaled + rng.normal(0.0, self.exploration_noise, scaled.shape), -1.0, 1.0)
+        agent = self.agent
+        scaled = agent.global_option.learner.policy.scale_action(agent.predict(observation)[0])
+        warm_up = agent.store.total < agent.learning_starts
+        explored, agent._held_actions, agent._hold_left = agent._explore(scaled.reshape(1, -1), [warm_up])
+        return explored[0].reshape(scaled.shape)
 
     def copy(self, env: gym.Env) -> "HindsightRecipe":
         """Return a copy that knows the same.
