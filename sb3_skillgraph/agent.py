@@ -296,7 +296,7 @@ class SkillGraphAgent(Rollouts):
         deterministic: bool = False,
     ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
         """
-        Act towards ``observation["desired_goal"]``: over the graph where a path leads, straight on where none does.
+        Act towards ``observation["desired_goal"]``: over the graph where a path leads, else along a way walked before.
 
         Pass the returned state back in, as with SB3's recurrent policies: it holds the running option. Without it an
         option is chosen anew at every step, which still makes progress but plans a thousand times.

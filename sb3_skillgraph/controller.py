@@ -13,10 +13,10 @@ from sb3_skillgraph.options.execution import Fate, fate
 from sb3_skillgraph.options.numpy_actor import NumpyActor
 from sb3_skillgraph.options.option import Option
 from sb3_skillgraph.options.views import View
-from sb3_skillgraph.planner import GraphPlanner
+from sb3_skillgraph.planner import GraphPlanner, Leg
 
 STILL = 0.25  # of the event radius: less is no movement
-MANY_DECISIONS = 12  # options on the way to a goal after which the next best way is tried
+MANY_DECISIONS = 12  # on the way to a goal, after which the next best way is tried
 UNDECIDED, GLOBAL = -1, 0  # no option yet; the global option. Others follow, in the order of their making.
 
 
@@ -25,12 +25,12 @@ class ControllerState(NamedTuple):
 
     :param option: index of the running option, or ``UNDECIDED``
     :param steps: environment steps it has run
-    :param aim: where the global option walks to: ``-1`` the goal itself, ``k >= 0`` event ``k``, ``-2 - k`` visited
-        point ``k``
+    :param aim: where the global option walks to: ``-1`` the goal itself, ``k >= 0`` event ``k``, ``-2 - 2 * k`` visited
+        point ``k`` on a way to the goal, ``-3 - 2 * k`` visited point ``k`` on a way to an event
     :param failures: approaches to the goal that have failed
     :param failed_last: index of the option that failed last on the way to the goal, ``-1`` for none
     :param failed_before: index of the one that failed before it, ``-1`` for none
-    :param decisions: options chosen so far on the way to the goal
+    :param decisions: options chosen so far on the way to the goal; going on along a way is no decision
     :param anchor: distance from what the option aims at, when it last changed noticeably
     :param still: environment steps since then
 
@@ -202,7 +202,7 @@ class Controller:
         if not success:
             state.aim[i] = -1  # so that no way is retraced further
         if not success and index == GLOBAL:
-            state.failures[i] += aim < 0
+            state.failures[i] += 1
         elif not success and index != state.failed_last[i]:
             state.failed_before[i], state.failed_last[i] = state.failed_last[i], index
         return OptionOutcome(i, index, aim, success, int(state.steps[i]))
@@ -229,9 +229,9 @@ class Controller:
             failed = {int(state.failed_last[i]), int(state.failed_before[i])}
             # Going round in circles is failing, too.
             failures = int(state.failures[i] + state.decisions[i] // MANY_DECISIONS)
-            retracing = bool(state.aim[i] < -1)
-            state.option[i], state.aim[i] = self.choose(points[i], requests[i], failures, failed, retracing)
-            state.decisions[i] += 1
+            before = int(state.aim[i])
+            state.option[i], state.aim[i] = self.choose(points[i], requests[i], failures, failed, before)
+            state.decisions[i] += not (_leads_to_goal(before) and _leads_to_goal(int(state.aim[i])))
             state.steps[i], state.still[i], state.anchor[i] = 0, 0, np.inf
         options = state.option.tolist()
         aims = np.array(
@@ -266,12 +266,12 @@ class Controller:
             return self.option(index).subgoal
         if aim >= 0:
             return self.event(aim).center
-        return request.goal if aim == -1 else self.planner.visited.point(-2 - aim)
+        return request.goal if aim == -1 else self.planner.visited.point((-2 - aim) // 2)
 
     # -- choosing an option -------------------------------------------------------------------------------------------
 
     def choose(
-        self, point: np.ndarray, request: Request, failures: int, failed: Collection[int], retracing: bool = False
+        self, point: np.ndarray, request: Request, failures: int, failed: Collection[int], last_aim: int = -1
     ) -> tuple[int, int]:
         """Choose the option to run next.
 
@@ -279,7 +279,7 @@ class Controller:
         :param request: what it is to do
         :param failures: approaches to the goal that have failed
         :param failed: indices of options that have failed lately
-        :param retracing: whether the agent has just reached a waypoint of a way it retraces
+        :param last_aim: where the last run of the global option has led (see :class:`ControllerState`)
         :return: index of the option; where the global option is to walk to (see :class:`ControllerState`)
         """
         if request.direct or not self.planning:
@@ -289,8 +289,10 @@ class Controller:
             return self._practise(point, request, failures, avoid)
         if request.event is not None:
             return self._towards(point, request.event, failures, avoid)
-        if retracing and self.planner.retraceable(point, request.goal):
-            return self._retrace(point, request.goal, -1, failures)  # do not turn back half-way
+        if _leads_to_goal(last_aim):  # do not turn back half-way
+            onward = self._retrace(point, request.goal, -1, failures)
+            if _leads_to_goal(onward[1]):
+                return onward
         return self._to_goal(point, request.goal, failures, avoid)
 
     def _practise(self, point: np.ndarray, request: Request, failures: int, avoid: Collection[str]) -> tuple[int, int]:
@@ -311,21 +313,24 @@ class Controller:
         return self._walk_to(point, entry, failures)
 
     def _to_goal(self, point: np.ndarray, goal: np.ndarray, failures: int, avoid: Collection[str]) -> tuple[int, int]:
-        """Follow the cheapest way to a goal; after a failed approach the next cheapest, then go straight, then begin anew."""
+        """Follow the cheapest way to a goal; after a failed approach the next one.
+
+        After all of them the global option retraces whatever way comes nearest, then goes straight, then all begins anew.
+        """
         legs = self.planner.legs(point, goal, avoid)
-        n_ways = max(len(legs), 2)  # without legs: to enter the graph, and to retrace what comes near
-        turn = failures % (n_ways + 1)
-        if turn == n_ways:
-            return GLOBAL, -1
-        if turn < len(legs):
-            path = legs[turn].path
-            if path is not None:
-                return self.index(self._first(path)), -1
-        elif turn == 0 and (nearest := self.planner.vertices_near(goal)):
+        ways: list[Leg | SalientEvent] = list(legs)
+        if not legs and (nearest := self.planner.vertices_near(goal)):
             entry = self.planner.entry(point, nearest[0][0].id)
-            if entry is not None:
-                return self._walk_to(point, entry, failures)
-        return self._retrace(point, goal, -1, failures)
+            ways += [] if entry is None else [entry]
+        turn = failures % (len(ways) + 2)
+        if turn > len(ways):
+            return GLOBAL, -1
+        way = ways[turn] if turn < len(ways) else None
+        if isinstance(way, SalientEvent):
+            return self._walk_to(point, way, failures)
+        if way is None or way.path is None:
+            return self._retrace(point, goal, -1, failures)
+        return self.index(self._first(way.path)), -1
 
     def _first(self, path: GraphPath) -> Option:
         return self.chaining.options[path.vertices[0]]
@@ -336,4 +341,9 @@ class Controller:
     def _retrace(self, point: np.ndarray, goal: np.ndarray, aim: int, failures: int) -> tuple[int, int]:
         """Walk to a goal by the global option, along a way that has been gone before if there is one."""
         waypoint = self.planner.waypoint(point, goal, failures)
-        return GLOBAL, aim if waypoint < 0 else -2 - waypoint
+        return GLOBAL, aim if waypoint < 0 else -2 - 2 * waypoint - (aim >= 0)
+
+
+def _leads_to_goal(aim: int) -> bool:
+    """Tell whether an aim of the global option is a waypoint on the way to the goal."""
+    return aim < -1 and aim % 2 == 0

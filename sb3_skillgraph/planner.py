@@ -1,6 +1,5 @@
 """Planning over the skill graph: to an event, and to a goal the agent never saw (sections 3.2.3, 3.2.4, 3.3)."""
 
-import math
 from collections.abc import Callable, Collection
 from typing import Literal, NamedTuple
 
@@ -8,7 +7,7 @@ import numpy as np
 
 from sb3_skillgraph.events import SalientEvent
 from sb3_skillgraph.graph import GraphPath, SkillGraph
-from sb3_skillgraph.visited import VisitedStates
+from sb3_skillgraph.visited import BACKWARDS, VisitedStates
 
 _Table = Callable[[np.ndarray, float, tuple[int, ...]], dict[int, int]]
 Status = Literal["in_graph", "in_initiation_set", "outside"]
@@ -103,7 +102,7 @@ class GraphPlanner:
             distances = [(event, float(np.linalg.norm(event.center - point))) for event in self.graph.events.values()]
         else:
             steps: dict[int, float] = {}
-            for table, doubt in ((seen, 1.0), (reversed_, 1.5)):
+            for table, doubt in ((seen, 1.0), (reversed_, BACKWARDS)):
                 for index, n in table(point, self.radius, without).items():
                     steps[index] = min(steps.get(index, np.inf), doubt * n)
             distances = [(self.graph.events[f"e{index}"], n) for index, n in steps.items()]
@@ -153,11 +152,6 @@ class GraphPlanner:
         """
         waypoint = self.waypoint(point, goal, 0)
         return goal if waypoint < 0 else self.visited.point(waypoint)
-
-    def retraceable(self, point: np.ndarray, goal: np.ndarray) -> bool:
-        """Tell whether a trajectory went from near one point to near another, or came from there."""
-        ways = (self.visited.steps_between(*ends, self._passing) for ends in ((point, goal), (goal, point)))
-        return any(map(math.isfinite, ways))
 
     def entry(self, point: np.ndarray, target: str | None) -> SalientEvent | None:
         """Return the event by which to enter the graph from a point outside.

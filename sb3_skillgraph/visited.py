@@ -5,6 +5,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+BACKWARDS = 1.5  # a step against the direction a trajectory was walked in is worth so many in it
+
 
 class _Place(NamedTuple):
     """Where an agent was found, in which event, and how far it can move before that must be looked at again."""
@@ -260,7 +262,7 @@ class VisitedStates:
     def waypoint(self, start: np.ndarray, goal: np.ndarray, radii: tuple[float, float], ahead: int) -> int:
         """Find the next point to walk to on the quickest way any trajectory took from near one point to near another.
 
-        If none did, but one came the other way, that one is followed backwards.
+        Or backwards along one that came the other way, where that is much shorter, or none went this way.
 
         :param start: shape ``(goal_dim,)``
         :param goal: shape ``(goal_dim,)``
@@ -271,11 +273,11 @@ class VisitedStates:
             leads there
         """
         here, there = self.near(start, radii[0]), self.near(goal, radii[1])
-        departure, arrival = self._passage(here, there)
         step, trajectory = self._step[: self.size], self._trajectory[: self.size]
-        if departure < 0:
-            arrival, departure = self._passage(there, here)
-            step = -step
+        departure, arrival = self._passage(here, there)
+        begin, end = self._passage(there, here)
+        if begin >= 0 and (departure < 0 or BACKWARDS * (step[end] - step[begin]) < step[arrival] - step[departure]):
+            departure, arrival, step = end, begin, -step
         if departure < 0:
             return -1
         way = (trajectory == trajectory[departure]) & (step >= step[departure] + ahead) & (step < step[arrival])

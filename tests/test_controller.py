@@ -37,8 +37,8 @@ def choose(world: World, x: float, request: Request, failures: int = 0, failed: 
 
 def waypoint(world: World, aim: int) -> np.ndarray:
     """The visited point that an aim of -2 and less stands for."""
-    assert -2 - world.visited.size < aim <= -2
-    return world.visited.points[-2 - aim].astype(np.float64)
+    assert -2 - 2 * world.visited.size < aim <= -2
+    return world.visited.points[(-2 - aim) // 2].astype(np.float64)
 
 
 def retrace(world: World, start: np.ndarray, request: Request, failures: int = 0) -> tuple[np.ndarray, int]:
@@ -157,13 +157,15 @@ def test_after_a_failed_approach_the_next_leg(line: World) -> None:
     legs = line.planner.legs(at(0.0)[0], goal.goal)
     assert len({leg.path.vertices[0] for leg in legs if leg.path is not None}) >= 2
     assert any(leg.path is None for leg in legs)  # the way walked before, from end to end
-    for failures, leg in enumerate([*legs, None, *legs]):
+    for failures, leg in enumerate([*legs, "retrace", "straight", *legs]):
         option, aim = choose(line, 0.0, goal, failures)
-        if leg is None:
+        if leg == "straight":
             assert (option, aim) == (GLOBAL, -1), "after all legs straight on, and then from the first again"
+        elif leg == "retrace" or leg.path is None:
+            assert option == GLOBAL
+            assert 0.0 < waypoint(line, aim)[0] < 14.0
         else:
-            assert option == (GLOBAL if leg.path is None else int(leg.path.vertices[0][1:]))
-            assert aim == -1 or leg.path is None
+            assert (option, aim) == (int(leg.path.vertices[0][1:]), -1)
 
 
 def test_a_failed_approach_leads_to_another_event() -> None:
@@ -199,7 +201,7 @@ def corner() -> World:
     return world
 
 
-@pytest.mark.parametrize("failures", [0, 1, 4])
+@pytest.mark.parametrize("failures", [0, 4, 6])
 @pytest.mark.parametrize("start", [(0.0, 0.0), (0.2, -0.3), (4.1, 0.2), (0.0, -3.0)])
 def test_the_global_option_retraces_a_known_way_around_a_corner(
     corner: World, start: tuple[float, float], failures: int
@@ -235,14 +237,14 @@ def test_a_way_back_nobody_has_gone_is_the_way_that_came(corner: World) -> None:
     assert len(points) > 2
 
 
-def test_a_way_back_once_begun_is_walked_to_its_end(corner: World) -> None:
-    begin, goal = np.array([10.0, 10.0]), np.zeros(2)
-    assert corner.planner.retraceable(begin, goal)
-    assert corner.planner.retraceable(goal, begin)
-    assert not corner.planner.retraceable(begin, np.array([0.0, 10.0]))
-    option, aim = corner.controller.choose(begin, Request(goal), 0, (), True)
-    assert option == GLOBAL
-    assert aim <= -2
+def test_nobody_having_come_near_the_goal_the_way_that_came_nearest_is_tried_too(corner: World) -> None:
+    """Nothing leads there: the global option retraces the way to the nearest point visited, goes straight, and anew."""
+    goal = np.array([10.0, 16.0])
+    for failures, straight in enumerate([False, True] * 2):
+        option, aim = choose(corner, 0.0, Request(goal), failures)
+        assert option == GLOBAL
+        assert (aim == -1) == straight
+        assert straight or waypoint(corner, aim)[1] == 0.0
 
 
 def test_by_euclidean_nearness_the_global_option_walks_straight() -> None:
@@ -273,20 +275,55 @@ def test_a_retraced_way_is_walked_waypoint_by_waypoint(corner: World) -> None:
 def test_a_way_once_begun_is_walked_to_its_end(line: World) -> None:
     """Where a plan over the graph would be cheaper, a walker that has just reached a waypoint goes on all the same."""
     goal = Request(at(20.0)[0])
-    assert choose(line, 0.0, goal) == (O1, -1)
-    option, aim = line.controller.choose(at(0.0)[0], goal, 0, (), True)
-    assert option == GLOBAL
-    assert 0.0 < waypoint(line, aim)[0] < 20.0
-    for x, expected in ((0.0, GLOBAL), (0.1, GLOBAL)):
-        start = state(option=[GLOBAL], aim=[-2], steps=[1])
-        running, outcomes = line.controller.advance(start, at(x), [goal])
-        assert [outcome.success for outcome in outcomes] == [True]
-        _, _, running = line.controller.act(observe(at(x)), running, [goal])
-        assert running.option.tolist() == [expected]
-    failed, _ = line.controller.advance(state(option=[GLOBAL], aim=[-10], steps=[5]), at(0.0), [goal])
-    assert (failed.option.tolist(), failed.aim.tolist()) == ([UNDECIDED], [-1])  # after a failure it plans anew
-    _, _, running = line.controller.act(observe(at(0.0)), failed._replace(failures=np.zeros(1, dtype=int)), [goal])
-    assert running.option.tolist() == [O1]
+    for last_aim, goes_on in ((-2, True), (-12, True), (-1, False), (2, False), (-3, False), (-13, False)):
+        option, aim = line.controller.choose(at(0.0)[0], goal, 0, (), last_aim)
+        assert (option, aim) == (O1, -1) if not goes_on else option == GLOBAL
+        assert not goes_on or 0.0 < waypoint(line, aim)[0] < 20.0
+    number = int(np.linalg.norm(line.visited.points, axis=1).argmin())
+    for x, at_waypoint in ((0.0, True), (4.0, False)):
+        begun = state(option=[GLOBAL], aim=[-2 - 2 * number], steps=[5])  # the global option's last step
+        ended, outcomes = line.controller.advance(begun, at(x), [goal])
+        assert [outcome.success for outcome in outcomes] == [at_waypoint]
+        assert (ended.aim[0] < -1) == at_waypoint
+        _, _, running = line.controller.act(observe(at(0.0)), ended._replace(failures=np.zeros(1, int)), [goal])
+        assert running.option.tolist() == [GLOBAL if at_waypoint else O1], "after a failure it plans anew"
+
+
+def test_going_on_along_a_way_is_no_decision() -> None:
+    """A way of many more waypoints than decisions are allowed is walked to its end."""
+    world = World(reach=9)
+    world.walk((0, 0), (40, 0), 100)
+    request, running, point, n_ends = [Request(at(40.0)[0])], ControllerState.fresh(1), at(0.0), 0
+    for _ in range(200):
+        _, aims, running = world.controller.act(observe(point), running, request)
+        point = point + np.clip(aims - point, -0.5, 0.5)
+        running, outcomes = world.controller.advance(running, point, request)
+        n_ends += len(outcomes)
+        if any(outcome.aim == -1 for outcome in outcomes):
+            break
+    assert n_ends > MANY_DECISIONS
+    assert running.decisions[0] <= 2  # to begin, and to go straight at last
+    assert running.failures.tolist() == [0]
+
+
+def test_on_the_way_to_an_event_no_way_back_to_the_goal_is_begun() -> None:
+    """Who has just passed a waypoint on the way to where the graph is entered plans as ever."""
+    world = World(reach=30)
+    world.add_event(10.0, 0.0)
+    option = world.add_option(world.add_event(10.0, 10.0), (10.0, 0.0))
+    world.tour([(0, 0), (10, 0), (10, 10)], 20)
+    world.walk((2, 0), (2, 8), 16)
+    goal = Request(np.array([2.0, 8.0]))
+    here = np.array([2.0, 0.0])
+    _, aim = world.controller.choose(here, to_event(world, "e1"), 0, ())
+    assert aim < -1
+    assert aim % 2 == 1, "a waypoint on a way to an event"
+    assert waypoint(world, aim)[0] > 2.0
+    there = np.array([10.0, 0.0])
+    assert world.controller.choose(there, to_event(world, "e1"), 0, (), aim) == (world.controller.index(option), -1)
+    _, onward = world.controller.choose(here, goal, 1, (), aim - 1)
+    _, anew = world.controller.choose(here, goal, 2, (), aim)
+    assert (onward % 2, anew) == (0, -1)
 
 
 def test_going_round_in_circles_is_failing_too(line: World) -> None:
@@ -377,8 +414,8 @@ def test_a_waypoint_is_reached_within_the_tolerance(line: World) -> None:
     k = int(np.linalg.norm(line.visited.points - at(7.0), axis=1).argmin())
     assert line.controller.tolerance < line.controller.radius
     for x, ended in ((7.4, True), (7.6, False), (6.6, True), (6.4, False)):
-        _, outcomes = line.controller.advance(state(option=[GLOBAL], aim=[-2 - k], steps=[1]), at(x), request)
-        assert outcomes == ([(0, GLOBAL, -2 - k, True, 1)] if ended else [])
+        _, outcomes = line.controller.advance(state(option=[GLOBAL], aim=[-2 - 2 * k], steps=[1]), at(x), request)
+        assert outcomes == ([(0, GLOBAL, -2 - 2 * k, True, 1)] if ended else [])
 
 
 def test_the_last_two_options_that_failed_are_remembered(line: World) -> None:
@@ -419,12 +456,11 @@ def test_what_failed_is_not_chosen_at_once_again(line: World) -> None:
         running = running._replace(steps=np.array([10]))
 
 
-def test_a_walk_to_an_event_is_no_approach_to_the_goal(line: World) -> None:
-    """``failures`` counts approaches to the goal; a failed walk to where the graph can be entered is none."""
+def test_a_walk_to_where_the_graph_can_be_entered_is_an_approach_to_the_goal(line: World) -> None:
     walk = state(option=[GLOBAL], aim=[0], steps=[5])
     running, outcomes = line.controller.advance(walk, at(5.0), [Request(at(14.0)[0])])
     assert [outcome.success for outcome in outcomes] == [False]
-    assert running.failures.tolist() == [0]
+    assert running.failures.tolist() == [1]
     for aim in (-1, -2, -9):  # the goal itself, or a waypoint of the way there
         running, _ = line.controller.advance(walk._replace(aim=np.array([aim])), at(50.0), [Request(at(14.0)[0])])
         assert running.failures.tolist() == [1]
