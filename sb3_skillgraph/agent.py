@@ -79,7 +79,7 @@ class SkillGraphAgent(Rollouts):
     :param hindsight: share of sampled transitions relabelled with a goal achieved later (none shortly before the agent gets
         stuck)
     :param goal_tolerance: how near the global option must come to a goal, and any option to one put in by hindsight, for
-        it to learn that it has reached it; in event radii
+        it to learn that it has reached it; in event radii, 1 at most
     :param shared_experience: share of an option's batches drawn from all experience rather than its own runs
     :param salience: how events are proposed: ``"frontier"`` (visited states), ``"rrt"`` (uniform feasible states from
         the environment's ``sample_free``), ``"dco"`` (the two ends of a learned Fiedler vector) or an object with

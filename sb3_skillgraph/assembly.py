@@ -41,6 +41,8 @@ class Assembly(Persistence):
         spec = self._spec = GoalSpec.of(self.observation_space, self.action_space)
         self.rng = np.random.default_rng(self.seed)
         self.event_radius = self._event_radius()
+        if not 0 < args["goal_tolerance"] <= 1:
+            raise ValueError(f"goal_tolerance must lie in (0, 1], not {args['goal_tolerance']!r}: it is a share of a radius.")
         self._view_name, function = find_view(args["option_view"], self.env)
         self.view = ScaledView(function, self.event_radius)
         self.store = TransitionStore(

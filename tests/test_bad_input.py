@@ -101,6 +101,8 @@ def test_environment_that_does_not_fit(env: Callable[[], gym.Env], message: str)
         dict(event_radius=0.0),
         dict(event_radius=-1.0),
         dict(event_radius=float("nan")),
+        dict(goal_tolerance=0.0),
+        dict(goal_tolerance=1.5),
         dict(learning_rate=lambda progress: 1e-3 * progress),
     ],
     ids=lambda arguments: next(iter(arguments)),

@@ -89,12 +89,29 @@ def test_the_recipe_learns_without_a_graph() -> None:
     assert evaluate_pairs(agent, TOY, n_pairs=30).success_rate >= 0.4
 
 
+class Pits(gym.Wrapper):
+    """Ends an episode for good after four steps, as a fall into a pit would: at no goal."""
+
+    def reset(self, **kwargs: Any) -> Any:
+        self.n_steps = 0
+        return self.env.reset(**kwargs)
+
+    def step(self, action: np.ndarray) -> Any:
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        self.n_steps += 1
+        return observation, reward, terminated or self.n_steps == 4, truncated, info
+
+
 def test_the_recipe_ends_episodes_at_goals_and_falls_but_knows_them_apart() -> None:
     store = HindsightRecipe(toy(), seed=0, learning_starts=10_000).learn(1_000).agent.store
     last = np.flatnonzero(np.diff(store._trajectory[:1_000]))
     distance = np.linalg.norm(store.column("next_achieved_goal", last) - store.column("goal", last), axis=1)
     assert (distance <= 0.45).sum() >= 3
     assert not store.terminated(np.arange(1_000)).any(), "an end at the episode's own goal is no end for another"
+    store = HindsightRecipe(Pits(toy()), seed=0, learning_starts=10_000).learn(40).agent.store
+    pits = np.flatnonzero(store.terminated(np.arange(40)))
+    assert len(pits) >= 5
+    assert not store.stuck(np.arange(40)).any()
     store = HindsightRecipe(Sinks(toy()), seed=0, learning_starts=10_000).learn(30).agent.store
     falls = np.flatnonzero(store.stuck(np.arange(29)))
     assert len(falls) >= 5
@@ -155,6 +172,12 @@ def test_a_covering_option_gets_there(covering: CoveringOptions) -> None:
     assert min(ends) < -1.3
     assert max(ends) > 1.3
     assert np.mean(hits) >= 0.6
+
+
+def test_a_goal_is_no_dead_end_for_covering_options_but_a_pit_is(covering: CoveringOptions) -> None:
+    assert not covering.store.terminated(np.arange(covering.store.total)).any()
+    store = CoveringOptions(Pits(toy()), n_options=1, option_freq=100, seed=0).learn(40).store
+    assert store.terminated(np.arange(40)).sum() >= 5
 
 
 def test_steps_are_the_environments_and_decisions_fewer(covering: CoveringOptions) -> None:

@@ -258,6 +258,7 @@ def test_killed_at_any_moment_it_comes_to_the_same_and_two_workers_share(tmp_pat
     [
         ({"methods": {"dsg": {"algorithm": "skil_graph"}}}, "unknown algorithm 'skil_graph'.*'skill_graph'"),
         ({"methods": {"dsg": {"algorithm": "skill_graph", "arguments": {"gama": 1}}}}, "unknown argument 'gama'"),
+        ({"methods": {"flat": {"algorithm": "recipe", "arguments": {"gama": 1}}}}, "unknown argument 'gama'"),
         ({"methods": {}}, "methods is missing"),
         ({"seeds": 3}, "seeds must be a list, not 3"),
         ({"check_every": 0}, "check_every must be a positive number, not 0"),

@@ -112,7 +112,8 @@ class CoveringOptions:
     option is learned by DDPG on all experience, in turns to the one and to the other end of an embedding of all
     experience, a new one for every pair; from then on it is among the actions of Q-learning.
 
-    :param env: a goal environment whose episodes end, and are paid, at the goal
+    :param env: a goal environment whose episodes end, and are paid, at the goal, with ``info["is_success"]``: without it an
+        end at the goal counts as a dead end
     :param n_options: number of options; the paper tries 3, 4, 5 and 10
     :param option_freq: episodes between options
     :param goal_freq: episodes per goal

@@ -21,7 +21,8 @@ class HindsightRecipe:
     :class:`~sb3_skillgraph.SkillGraphAgent` with the same arguments, under the same noise, and all of that agent's updates go
     to it. Goals are the environment's, and there are no events, no plans and no ways remembered.
 
-    :param env: a goal environment whose episodes end at the goal
+    :param env: a goal environment whose episodes end at the goal, with ``info["is_success"]``: without it an end at the
+        goal counts as one for every other goal, too
     :param seed: of everything random
     :param kwargs: further arguments of :class:`~sb3_skillgraph.SkillGraphAgent`; those of the graph have no effect
     :raises ValueError: if updates are to follow episodes instead of steps
