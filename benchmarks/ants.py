@@ -6,7 +6,8 @@ The agents are the checkpoints of ``sb3-skillgraph compare benchmarks/compare_an
 random goals at least 2 cells of path away, as ``evaluate_pairs`` draws them; the least distance from the goal in 1000 steps
 of 0.1 s tells whether it was reached within 0.45 m (the success radius), 0.6 m (the paper's) and 0.6 of a cell (2.4 m, about
 what DHRL asks for: 5 m in cells of 8 m). *Far goal*: from the training start to the free cell with the longest path, 32 times.
-An episode ends when the ant is on its back. *Cells*: share of the maze's free squares of 1 m that were visited in the last
+An episode ends when the ant is on its back. *Straight*: the same pairs by the same agent without planning, its global option
+walking straight to the goal. *Cells*: share of the maze's free squares of 1 m that were visited in the last
 50 000 steps of training, and by a random walk in as many (its episodes end with a fall, too).
 """
 
@@ -29,7 +30,7 @@ from sb3_skillgraph.experiments.learners import load_agent
 from sb3_skillgraph.experiments.runner import CONFIG, checkpoints
 
 TOLERANCES = {"0.45 m": 0.45, "0.6 m": 0.6, "0.6 cells": 2.4}
-KINDS = ("pairs", "far", "cells")
+WALKS = ("pairs", "far", "straight")
 N_PAIRS, N_FAR, N_LAST = 100, 32, 50_000
 
 
@@ -99,14 +100,17 @@ def test_run(folder: pathlib.Path) -> dict[str, Any]:
     goal = farthest_cell(geometry)
     far = [walk(agent, env, {"goal": goal}) for _ in range(N_FAR)]
     last = np.arange(max(agent.store.oldest, agent.store.total - N_LAST), agent.store.total)
+    agent.planning = False
+    straight = [walk(agent, env, {"start": start, "goal": goal}) for start, goal, _ in drawn]
     visits = {
         "agent": visited_share(geometry, agent.store.column("next_achieved_goal", last)),
         "random walk": visited_share(
             geometry, random_walk(gym.make(config["env_id"], **config["env_kwargs"]), config["seed"])
         ),
     }
-    summary = {"pairs": rates(pairs), "far": rates(far), "cells": visits}
-    return {"seed": config["seed"], "steps": max(saved), **summary, "walks": pairs, "far_walks": far}
+    walks = dict(zip(WALKS, (pairs, far, straight), strict=True))
+    summary = {kind: rates(walked) for kind, walked in walks.items()}
+    return {"seed": config["seed"], "steps": max(saved), **summary, "cells": visits, "walks": walks}
 
 
 def main() -> None:
@@ -119,10 +123,8 @@ def main() -> None:
     runs = []
     for folder in args.runs:
         runs.append(test_run(folder))
-        print({name: runs[-1][name] for name in ("seed", "steps", *KINDS)}, flush=True)
-    means = {
-        kind: {name: float(np.mean([run[kind][name] for run in runs])) for name in runs[0][kind]} for kind in ("pairs", "far")
-    }
+        print({name: value for name, value in runs[-1].items() if name != "walks"}, flush=True)
+    means = {kind: {name: float(np.mean([run[kind][name] for run in runs])) for name in runs[0][kind]} for kind in WALKS}
     command = f"python -m benchmarks.ants {shlex.join(sys.argv[1:])}"
     args.out.parent.mkdir(parents=True, exist_ok=True)
     args.out.write_text(json.dumps({"command": command, "version": __version__, **means, "runs": runs}, indent=1) + "\n")

@@ -64,7 +64,8 @@ class SkillGraphAgent(Rollouts):
         ``"placed_body"`` (and where that is) or a function; None takes the one the environment names in its attribute
         ``option_view``, else ``"relative"``
     :param option_timeout: environment steps an option may run [A.6]
-    :param stall_steps: environment steps after which a run counts as failed that stands still; None for never
+    :param stall_steps: environment steps after which a run counts as failed that stands still, and the next one begins with a
+        random action; None for never
     :param event_radius: radius of salient events, in goal units; None takes the environment's ``success_radius`` or
         ``distance_threshold``
     :param gestation_period: successes after which an option is mature

@@ -16,14 +16,16 @@ from sb3_skillgraph.options.views import View
 from sb3_skillgraph.planner import GraphPlanner, Leg
 
 STILL = 0.25  # of the event radius: less is no movement
+SHAKE = 10  # steps of a random action after a run that stood still: a policy without noise would stand there for ever
 MANY_DECISIONS = 12  # on the way to a goal, after which the next best way is tried
-UNDECIDED, GLOBAL = -1, 0  # no option yet; the global option. Others follow, in the order of their making.
+#: The last option has failed, and none runs; none runs; the global option. Others follow, in the order of their making.
+FAILED, UNDECIDED, GLOBAL = -2, -1, 0
 
 
 class ControllerState(NamedTuple):
     """All that must be remembered between two steps; arrays of shape ``(n_envs,)``.
 
-    :param option: index of the running option, or ``UNDECIDED``
+    :param option: index of the running option, ``UNDECIDED``, or ``FAILED`` where it is to be chosen after a failure
     :param steps: environment steps it has run
     :param aim: where the global option walks to: ``-1`` the goal itself, ``k >= 0`` event ``k``, ``-2 - 2 * k`` visited
         point ``k`` on a way to the goal, ``-3 - 2 * k`` visited point ``k`` on a way to an event
@@ -32,7 +34,7 @@ class ControllerState(NamedTuple):
     :param failed_before: index of the one that failed before it, ``-1`` for none
     :param decisions: options chosen so far on the way to the goal; going on along a way is no decision
     :param anchor: distance from what the option aims at, when it last changed noticeably
-    :param still: environment steps since then
+    :param still: environment steps since then; negative: of a random action still to come
 
     States are never changed in place: the one before and the one after a step may share arrays.
     """
@@ -171,7 +173,7 @@ class Controller:
         lost = [False] * len(requests) if stuck is None else stuck.tolist()
         ended: list[tuple[int, bool]] = []
         for i, index in enumerate(state.option.tolist()):
-            if index == UNDECIDED:
+            if index < GLOBAL:
                 continue
             what = self._fate(index, state, i, points[i], requests[i], lost[i])
             if what != Fate.RUNNING:
@@ -184,9 +186,11 @@ class Controller:
     def _fate(self, index: int, state: ControllerState, i: int, point: np.ndarray, request: Request, stuck: bool) -> Fate:
         if index != GLOBAL and f"o{index}" not in self.chaining.options:
             return Fate.TIMED_OUT  # pruned meanwhile
-        stalled = self.stall_steps is not None and int(state.still[i]) >= self.stall_steps
-        timeout = 0 if stalled else self.timeout if index != GLOBAL else self.timeout // 2
+        timeout = 0 if self._stalled(state, i) else self.timeout if index != GLOBAL else self.timeout // 2
         return fate(self._reached(index, int(state.aim[i]), request, point), int(state.steps[i]), timeout, stuck)
+
+    def _stalled(self, state: ControllerState, i: int) -> bool:
+        return self.stall_steps is not None and int(state.still[i]) >= self.stall_steps
 
     def _reached(self, index: int, aim: int, request: Request, point: np.ndarray) -> bool:
         if index != GLOBAL:
@@ -198,7 +202,7 @@ class Controller:
 
     def _end(self, state: ControllerState, i: int, success: bool) -> OptionOutcome:
         index, aim = int(state.option[i]), int(state.aim[i])
-        state.option[i] = UNDECIDED
+        state.option[i] = UNDECIDED if success else FAILED
         if not success:
             state.aim[i] = -1  # so that no way is retraced further
         if not success and index == GLOBAL:
@@ -222,17 +226,19 @@ class Controller:
             ``(n_envs, goal_dim)``; the state after the step
         """
         points = observation["achieved_goal"]
-        undecided = [i for i, index in enumerate(state.option.tolist()) if index == UNDECIDED]
+        undecided = [i for i, index in enumerate(state.option.tolist()) if index < GLOBAL]
         if undecided:
             state = state.copy()
         for i in undecided:
             failed = {int(state.failed_last[i]), int(state.failed_before[i])}
-            # Going round in circles is failing, too.
-            failures = int(state.failures[i] + state.decisions[i] // MANY_DECISIONS)
+            # Where it has not just failed it takes the best way. Going round in circles is failing, too.
+            failures = int(state.failures[i]) if state.option[i] == FAILED else 0
+            failures += int(state.decisions[i]) // MANY_DECISIONS
             before = int(state.aim[i])
             state.option[i], state.aim[i] = self.choose(points[i], requests[i], failures, failed, before)
             state.decisions[i] += not (_leads_to_goal(before) and _leads_to_goal(int(state.aim[i])))
-            state.steps[i], state.still[i], state.anchor[i] = 0, 0, np.inf
+            state.still[i] = -SHAKE if self._stalled(state, i) else 0
+            state.steps[i], state.anchor[i] = 0, np.inf
         options = state.option.tolist()
         aims = np.array(
             [self._aim(*what) for what in zip(options, state.aim.tolist(), requests, strict=True)], dtype=np.float32
@@ -242,15 +248,18 @@ class Controller:
             actions = self._actor(options[0]).act(seen)
         else:
             actions = np.concatenate([self._actor(index).act(seen[i : i + 1]) for i, index in enumerate(options)])
+        for i in np.flatnonzero(state.still < 0).tolist():
+            rng = np.random.default_rng([int(state.failures[i]), int(state.decisions[i])])  # acting depends on the state alone
+            actions[i] = rng.uniform(-1.0, 1.0, actions.shape[1])
         still, anchor = self._watch(state, points, aims)
         return actions, aims, state._replace(steps=state.steps + 1, still=still, anchor=anchor)
 
     def _watch(self, state: ControllerState, points: np.ndarray, aims: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Count the steps for which an agent has stood still: its distance from where it is going tells."""
+        """Count the steps for which an agent has stood still, by its distance from where it is going, or is shaken loose."""
         still, anchor = state.still.tolist(), state.anchor.tolist()
         for i, (point, aim) in enumerate(zip(points.tolist(), aims.tolist(), strict=True)):
             distance = math.dist(point, aim)
-            if abs(distance - anchor[i]) < STILL * self.radius:
+            if still[i] < 0 or abs(distance - anchor[i]) < STILL * self.radius:
                 still[i] += 1
             else:
                 still[i], anchor[i] = 0, distance

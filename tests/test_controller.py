@@ -6,7 +6,16 @@ import numpy as np
 import pytest
 from builders import World
 
-from sb3_skillgraph.controller import GLOBAL, MANY_DECISIONS, UNDECIDED, Controller, ControllerState, Request
+from sb3_skillgraph.controller import (
+    FAILED,
+    GLOBAL,
+    MANY_DECISIONS,
+    SHAKE,
+    UNDECIDED,
+    Controller,
+    ControllerState,
+    Request,
+)
 
 O1, O2, O3, O4 = 1, 2, 3, 4
 
@@ -179,6 +188,16 @@ def test_a_failed_approach_leads_to_another_event() -> None:
     goal = Request(np.array([10.0, 10.0]))
     chosen = [world.controller.choose(start.center, goal, failures, ())[0] for failures in range(3)]
     assert chosen == [world.controller.index(first), world.controller.index(second), GLOBAL]
+
+
+def test_only_after_a_failure_another_way_is_tried(line: World) -> None:
+    line.add_option(line.graph.events["e2"], (0.0, 0.0), failures=5)  # straight to e2, but dear
+    goal = Request(at(14.0)[0])
+    first, second = (leg.path for leg in line.planner.legs(at(0.0)[0], goal.goal)[:2])
+    for before, path in ((FAILED, second), (UNDECIDED, first)):
+        _, _, running = line.controller.act(observe(at(0.0)), state(option=[before], failures=[1]), [goal])
+        assert running.option.tolist() == [GLOBAL if path is None else int(path.vertices[0][1:])]
+        assert running.failures.tolist() == [1]
 
 
 def test_practice_plans_to_the_chains_source_and_then_follows_the_chain(line: World) -> None:
@@ -391,7 +410,7 @@ def test_options_time_out_the_global_one_sooner(line: World, option: int, timeou
     assert outcomes == []
     running, outcomes = line.controller.advance(state(option=[option], steps=[timeout]), at(5.0), request)
     assert outcomes == [(0, option, -1, False, timeout)]
-    assert running.option.tolist() == [UNDECIDED]
+    assert running.option.tolist() == [FAILED]
 
 
 def test_success_beats_a_timeout_on_the_same_step(line: World) -> None:
@@ -545,3 +564,25 @@ def test_standing_still_counts_anew_for_every_option(line: World) -> None:
     request = [to_event(line, "e1")]
     _, _, state = line.controller.act(observe(at(0.0)), ControllerState.fresh(1)._replace(still=np.array([2])), request)
     assert int(state.still[0]) == 0
+
+
+def test_what_stood_still_is_shaken_loose(line: World) -> None:
+    """After a run that stood still the next one begins with a random action, another one every time; then it acts again."""
+    controller, request = line.controller, [to_event(line, "e1")]
+    controller.stall_steps = 3
+    running, actions, last = ControllerState.fresh(1), [], -1
+    for _ in range(3 * (SHAKE + 4)):
+        running, outcomes = controller.advance(running, at(0.0), request)
+        action, _, after = controller.act(observe(at(0.0)), running, request)
+        np.testing.assert_array_equal(action, controller.act(observe(at(0.0)), running, request)[0])  # by the state alone
+        last = len(actions) if outcomes else last
+        actions.append(action[0])
+        running = after
+    policy, shaken = actions[0], actions[4 : 4 + SHAKE]
+    np.testing.assert_array_equal(actions[3], policy)
+    assert all((action == shaken[0]).all() for action in shaken)
+    assert not np.allclose(shaken[0], policy)
+    assert np.abs(shaken[0]).max() <= 1.0
+    np.testing.assert_array_equal(actions[4 + SHAKE], policy)
+    assert last > 4
+    assert not np.allclose(actions[last], shaken[0])

@@ -15,7 +15,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from sb3_skillgraph import OptionEnv, OptionsEnv, SkillGraphAgent
 from sb3_skillgraph.baselines import CoveringOptions
-from sb3_skillgraph.controller import GLOBAL, ControllerState, Request
+from sb3_skillgraph.controller import FAILED, GLOBAL, ControllerState, Request
 from sb3_skillgraph.events import SalientEvent
 
 PIT, DEPTH = np.array([0.0, 1.4]), 0.45  # beside the way from the toy maze's start
@@ -123,18 +123,18 @@ def test_being_stuck_ends_an_option_as_failed_even_where_it_leads(option: int) -
     for point in (goal[None] - 5.0, goal[None]):
         state, outcomes = world.controller.advance(running, point, request, np.array([True]))
         assert outcomes == [(0, option, -1, False, 3)]
-        assert state.option.tolist() == [-1]
+        assert state.option.tolist() == [FAILED]
 
 
 def test_learning_resumes_exactly(tmp_path: Any) -> None:
-    whole = new_agent(pit_env()).learn(800, log_interval=None)
-    half = new_agent(pit_env()).learn(400, log_interval=None)
+    whole = new_agent(pit_env()).learn(1200, log_interval=None)
+    half = new_agent(pit_env()).learn(600, log_interval=None)
     assert 0 < half.curriculum.n_stuck < whole.curriculum.n_stuck
     half.save(tmp_path / "agent.zip")
     half.save_replay_buffer(tmp_path / "replay.zip")
     resumed = SkillGraphAgent.load(tmp_path / "agent.zip", env=half.get_env())
     resumed.load_replay_buffer(tmp_path / "replay.zip")
-    resumed.learn(400, reset_num_timesteps=False, log_interval=None)
+    resumed.learn(600, reset_num_timesteps=False, log_interval=None)
     assert differences(without_clock(state_of(resumed)), without_clock(state_of(whole))) == []
 
 
