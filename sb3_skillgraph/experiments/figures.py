@@ -156,7 +156,7 @@ def curves(specs: Sequence[RunSpec], out: Path) -> Axes:
         seeds = Counter(spec.method for spec in here if (spec.folder(out) / DONE).exists()).values()
         fewest, most = min(seeds, default=0), max(seeds, default=0)
         n_seeds = f"{most}" if fewest == most else f"{fewest} to {most}"
-        draw.plot_curves(axes, by_method, methods, f"{label} ({n_seeds} seeds)")
+        draw.plot_curves(axes, by_method, methods, f"{label} ({n_seeds} seed{'s' * (most > 1)})")
     if any(testing):
         for axes, by_method, label in zip(panels[len(labels) :], testing, labels, strict=True):
             draw.plot_curves(axes, by_method, methods, f"{label}, at test time", "environment steps with the goal")
