@@ -572,6 +572,18 @@ def test_an_ant_on_its_back_is_stuck_until_the_reset():
     assert "stuck" not in env.reset()[1]
 
 
+def test_an_ant_need_not_be_that_of_d4rl():
+    env = make(ANT, torque=150, frame_skip=5, tell_stuck=False)
+    assert (env.unwrapped.model.actuator_gear[:, 0] == 150).all()
+    assert env.metadata["render_fps"] == 20
+    env.reset(seed=0)
+    before = env.unwrapped.data.time
+    env.unwrapped.data.qpos[2:7] = [1.0, 0.0, 1.0, 0.0, 0.0]
+    assert "stuck" not in env.step(np.zeros(8, dtype=np.float32))[4]
+    assert env.unwrapped.data.time - before == pytest.approx(0.05)
+    assert pickle.loads(pickle.dumps(env)).unwrapped.tell_stuck is False
+
+
 def test_random_actions_rarely_flip_the_ant():
     env = make("SkillGraph/AntReacher-v0")
     env.action_space.seed(0)

@@ -22,8 +22,6 @@ with contextlib.redirect_stderr(io.StringIO()):
     from gymnasium_robotics.envs.maze import ant_maze_v5, point_maze
 
 _POINT_CELL_SIZE, _ANT_CELL_SIZE = 1.0, 4.0
-_ANT_TORQUE = 30.0
-_ANT_FRAME_SKIP = 10
 _UPRIGHT = 0.2  # upward component of the torso's axis below which it lies on its side or back
 _FULL_STATE = mujoco.mjtState.mjSTATE_INTEGRATION
 _temporary_directory_lock = threading.Lock()
@@ -137,15 +135,17 @@ class AntMazeEnv(MujocoMazeTask, ant_maze_v5.AntMazeEnv):
     out x and y, which are the achieved goal. ``info["stuck"]`` is there, and True, once it has fallen on its back, from
     where it cannot get up.
 
-    Torque and control period are those of D4RL's ant: an action in [-1, 1] is a torque in [-30, 30] instead of
-    [-150, 150], held for 0.1 s instead of 0.05 s (10 simulator steps of 0.01 s instead of 5). With the strong motors
-    random actions throw the ant on its back within seconds.
+    Torque and control period are those of D4RL's ant; ``AntMaze-v5`` has 150 and 5. With motors that strong random actions
+    throw the ant on its back within seconds.
 
     :param maze_map: rows of cells, see :class:`~sb3_skillgraph.envs.maze_geometry.MazeGeometry`; required
     :param render_mode: None or one of ``metadata["render_modes"]``
     :param success_radius: distance to the goal that counts as success, in metres
-    :param max_steps: steps of 0.1 s after which an episode is truncated
+    :param max_steps: steps after which an episode is truncated
     :param terminate_on_success: whether reaching the goal ends the episode
+    :param torque: that an action of 1 means, the simulator's units
+    :param frame_skip: simulator steps of 0.01 s that an action is held for; an environment step
+    :param tell_stuck: whether ``info`` says so when the ant has fallen on its back; otherwise it lies there
     :raises ValueError: when an argument is unusable
     """
 
@@ -165,18 +165,25 @@ class AntMazeEnv(MujocoMazeTask, ant_maze_v5.AntMazeEnv):
         success_radius: float = 0.45,
         max_steps: int = 1000,
         terminate_on_success: bool = False,
+        torque: float = 30.0,
+        frame_skip: int = 10,
+        tell_stuck: bool = True,
     ) -> None:
         geometry = make_geometry(maze_map, _ANT_CELL_SIZE)
         with private_temporary_directory():
             super().__init__(
                 maze_map=geometry.maze_map,
                 render_mode=render_mode,
-                frame_skip=_ANT_FRAME_SKIP,
+                frame_skip=frame_skip,
                 include_cfrc_ext_in_observation=False,
             )
-        self.model.actuator_gear[:, 0] = _ANT_TORQUE
+        self.model.actuator_gear[:, 0] = torque
         self._init_task(geometry, success_radius, max_steps, terminate_on_success)
-        EzPickle.__init__(self, maze_map, render_mode, success_radius, max_steps, terminate_on_success)
+        self.metadata = {**self.metadata, "render_fps": round(1.0 / self.ant_env.dt)}
+        self.tell_stuck = tell_stuck
+        EzPickle.__init__(
+            self, maze_map, render_mode, success_radius, max_steps, terminate_on_success, torque, frame_skip, tell_stuck
+        )
 
     @property
     def _simulator(self) -> MujocoEnv:
@@ -188,7 +195,8 @@ class AntMazeEnv(MujocoMazeTask, ant_maze_v5.AntMazeEnv):
     def _make_info(self, success: bool) -> dict[str, Any]:
         _, x, y, _ = self.ant_env.data.qpos[3:7].tolist()
         info = super()._make_info(success)
-        return info if 1.0 - 2.0 * (x * x + y * y) > _UPRIGHT else {**info, "stuck": True}
+        fallen = 1.0 - 2.0 * (x * x + y * y) <= _UPRIGHT
+        return {**info, "stuck": True} if fallen and self.tell_stuck else info
 
 
 def make_geometry(maze_map: MazeMap | None, cell_size: float) -> MazeGeometry:

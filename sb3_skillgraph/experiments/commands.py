@@ -112,8 +112,10 @@ def _status(args: argparse.Namespace) -> int:
 
 def _print_status(runs: list[RunStatus]) -> None:
     table = Table()
-    for column in ("environment", "method", "done", "running", "failed", "success (IQM, 95 %)", "time left"):
-        table.add_column(column, justify="left" if column in ("environment", "method") else "right")
+    for column in ("environment", "method"):
+        table.add_column(column, no_wrap=True)
+    for column in ("done", "running", "failed", "success (IQM, 95 %)", "time left"):
+        table.add_column(column, justify="right")
     for environment, method in dict.fromkeys((run.spec.environment, run.spec.method) for run in runs):
         here = [run for run in runs if (run.spec.environment, run.spec.method) == (environment, method)]
         states = Counter(run.state for run in here)
@@ -124,10 +126,9 @@ def _print_status(runs: list[RunStatus]) -> None:
             success = f"{mean:.2f} ({low:.2f} to {high:.2f})"
         known = [run.seconds_left for run in here if run.seconds_left is not None and run.state != "done"]
         waiting = sum(run.seconds_left is None for run in here)
-        left = f"{sum(known) / 60:.0f} min" + (f" and {waiting} to begin" if waiting else "")
-        table.add_row(
-            environment, method, f"{states['done']}/{len(here)}", str(states["running"]), str(states["failed"]), success, left
-        )
+        left = [f"{sum(known) / 60:.0f} min"] * bool(known) + [f"{waiting} to begin"] * bool(waiting)
+        counts = (f"{states['done']}/{len(here)}", str(states["running"]), str(states["failed"]))
+        table.add_row(environment, method, *counts, success, " and ".join(left) or "-")
     Console().print(table)
 
 
