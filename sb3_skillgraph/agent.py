@@ -77,8 +77,8 @@ class SkillGraphAgent(Rollouts):
     :param saturation_penalty: weight, in the loss of ``OptionDDPG``'s and ``OptionTD3``'s actors, of the mean square of
         what their tanh is given: keeps them from getting stuck at the bounds of the actions
     :param shaping: reward for every event radius of distance gained, beside -1 a step; 0 for none [2.1]
-    :param hindsight: share of sampled transitions relabelled with a goal achieved later (none shortly before the agent gets
-        stuck)
+    :param hindsight: share of sampled transitions relabelled with a goal achieved later
+    :param doomed_steps: environment steps before the agent got stuck in which none are relabelled
     :param goal_tolerance: how near the global option must come to a goal, and any option to one put in by hindsight, for
         it to learn that it has reached it; in event radii, 1 at most
     :param shared_experience: share of an option's batches drawn from all experience rather than its own runs
@@ -158,6 +158,7 @@ class SkillGraphAgent(Rollouts):
         saturation_penalty: float = 1e-4,
         shaping: float = 0.0,
         hindsight: float = 0.8,
+        doomed_steps: int = 50,
         goal_tolerance: float = 0.5,
         shared_experience: float = 0.5,
         salience: Literal["frontier", "rrt", "dco"] | Salience = "frontier",

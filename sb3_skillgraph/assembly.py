@@ -59,7 +59,7 @@ class Assembly(Persistence):
             self.event_radius,
             args["goal_tolerance"] * self.event_radius,
             self.rng,
-            dict(hindsight=args["hindsight"], shared=args["shared_experience"], horizon=args["option_timeout"]),
+            self._replay_kwargs(),
             self.device,
             args["shaping"],
         )
@@ -102,6 +102,11 @@ class Assembly(Persistence):
         else:
             kwargs.update(learning_rate=self.learning_rate)
         return {**kwargs, **(self._arguments["option_kwargs"] or {})}
+
+    def _replay_kwargs(self) -> dict[str, Any]:
+        args = self._arguments
+        shares = dict(hindsight=args["hindsight"], shared=args["shared_experience"])
+        return {**shares, "horizon": args["option_timeout"], "doomed_steps": args["doomed_steps"]}
 
     def _build_skills(self) -> None:
         args = self._arguments

@@ -10,7 +10,6 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
-DOOMED_STEPS = 50  # before the agent got stuck, in which no goal is put in by hindsight
 _COLUMNS = ("observation", "achieved_goal", "next_observation", "next_achieved_goal", "action", "goal")
 
 
@@ -277,6 +276,7 @@ class OptionReplay(ReplayBuffer):
     :param hindsight: share of own transitions that take an achieved goal
     :param shared: share of a batch that comes from the whole store
     :param horizon: steps ahead from which an achieved goal is drawn
+    :param doomed_steps: steps before the agent got stuck in which no goal is put in
     :param capacity: number of own row numbers kept
     :param device: torch device of the samples
     """
@@ -294,6 +294,7 @@ class OptionReplay(ReplayBuffer):
         hindsight: float = 0.8,
         shared: float = 0.5,
         horizon: int = 200,
+        doomed_steps: int = 50,
         capacity: int = 100_000,
         device: th.device | str = "auto",
     ) -> None:
@@ -307,6 +308,7 @@ class OptionReplay(ReplayBuffer):
         self.hindsight = hindsight
         self.shared = shared
         self.horizon = horizon
+        self.doomed_steps = doomed_steps
         self.buffer_size = capacity
         self._rows = np.zeros(256, dtype=np.int64)
         self._n_rows = 0
@@ -357,7 +359,7 @@ class OptionReplay(ReplayBuffer):
         data = store.read(rows)
         goal, next_achieved_goal = data["goal"], data["next_achieved_goal"]
         # What was achieved on the way to getting stuck would make that way look safe: it all came before.
-        doomed = store.doomed(rows, DOOMED_STEPS)
+        doomed = store.doomed(rows, self.doomed_steps)
         imagined[:n_own] &= ~doomed[:n_own]
         relabelled = imagined & ~doomed
         later = store.future(rows[relabelled], self.horizon, rng)

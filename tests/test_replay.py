@@ -15,9 +15,10 @@ from sb3_skillgraph.events import SalientEvent
 from sb3_skillgraph.options.env import OptionEnv
 from sb3_skillgraph.options.option import goal_rule, termination_rule
 from sb3_skillgraph.options.views import ScaledView, relative_view
-from sb3_skillgraph.replay import DOOMED_STEPS, OptionReplay, OptionRule, TransitionStore
+from sb3_skillgraph.replay import OptionReplay, OptionRule, TransitionStore
 
 CAPACITY = 12
+DOOMED_STEPS = 50  # an OptionReplay's own
 #: One step of all environments: who is done, and whether the store is cut afterwards.
 Step = tuple[list[bool], bool]
 steps = st.lists(
@@ -266,19 +267,20 @@ def test_the_global_options_rule_is_the_distance_to_its_goal() -> None:
 
 
 @pytest.mark.parametrize("n_envs", [1, 2])
-def test_no_goal_is_put_in_shortly_before_the_agent_gets_stuck(n_envs: int) -> None:
+@pytest.mark.parametrize("doomed_steps", [0, 20, 50])
+def test_no_goal_is_put_in_shortly_before_the_agent_gets_stuck(n_envs: int, doomed_steps: int) -> None:
     """It would have been achieved, so that the way there would look safe."""
-    n_steps = DOOMED_STEPS + 30
+    n_steps = 80
     store = SpyStore(3 * n_steps * n_envs // 2, OBSERVATION_DIM, 2, 1, n_envs)
     for t in range(2 * n_steps):  # walks that get stuck, half of the first overwritten; then walks that do not
         number = np.arange(t * n_envs, (t + 1) * n_envs, dtype=np.float32)[:, None]
         last = np.full(n_envs, t % n_steps == n_steps - 1)
         point, pursued = number.repeat(2, 1), np.full((n_envs, 2), 1e4)
         store.add(number, point, number, point, number, pursued, last, last, last & (t < n_steps))
-    replay = make_replay(store, goal_rule(RADIUS), everything=True, hindsight=1.0)
+    replay = make_replay(store, goal_rule(RADIUS), everything=True, hindsight=1.0, doomed_steps=doomed_steps)
     samples = replay.sample(8000)
     kept = {int(row) for row, seen in zip(samples.actions[:, 0], samples.observations, strict=True) if seen[-1] == 1e4}
-    assert kept == set(range(n_envs * max(30, n_steps // 2), n_envs * n_steps))
+    assert kept == set(range(n_envs * (n_steps - min(doomed_steps, n_steps // 2)), n_envs * n_steps))
 
 
 def test_both_outcomes_occur_in_the_walks() -> None:
