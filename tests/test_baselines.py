@@ -32,6 +32,13 @@ def test_a_goal_is_kept_for_some_episodes() -> None:
     assert tuple(env.reset()[0]["desired_goal"]) == goals[6]
 
 
+def test_the_goal_conditioned_baselines_give_up_when_stuck() -> None:
+    for make in (make_uvfa, make_her):
+        (env,) = make(Sinks(toy()), seed=0).get_env().envs
+        env.reset(options={"start": [-1.0, 1.0], "goal": [1.0, 1.0]})
+        assert [env.step(np.zeros(2, dtype=np.float32))[2] for _ in range(3)] == [False, False, True]
+
+
 def test_the_goal_conditioned_baselines_are_sb3s_own() -> None:
     uvfa, her = make_uvfa(toy(), seed=0, goal_freq=5), make_her(toy(), seed=0, batch_size=64)
     assert type(uvfa) is type(her) is DDPG
@@ -176,8 +183,13 @@ def test_a_covering_option_gets_there(covering: CoveringOptions) -> None:
 
 def test_a_goal_is_no_dead_end_for_covering_options_but_a_pit_is(covering: CoveringOptions) -> None:
     assert not covering.store.terminated(np.arange(covering.store.total)).any()
-    store = CoveringOptions(Pits(toy()), n_options=1, option_freq=100, seed=0).learn(40).store
-    assert store.terminated(np.arange(40)).sum() >= 5
+    learner = CoveringOptions(Pits(toy()), n_options=1, option_updates=5, reach=3, seed=0).learn(200)
+    store, replay = learner.store, learner.options[0].learner.replay_buffer
+    rows = copy.deepcopy(replay.rng).integers(0, store.total, 400)
+    pits = store.terminated(rows)
+    covered = learner.options[0].termination.contains(store.column("next_achieved_goal", rows))
+    assert (pits & ~covered).sum() >= 5
+    np.testing.assert_array_equal(replay.sample(400).dones[:, 0] == 1.0, pits | covered)
 
 
 def test_steps_are_the_environments_and_decisions_fewer(covering: CoveringOptions) -> None:
@@ -185,6 +197,7 @@ def test_steps_are_the_environments_and_decisions_fewer(covering: CoveringOption
     assert covering.store.total == covering.num_timesteps
     assert covering.model.num_timesteps < covering.num_timesteps
     assert covering.model.exploration_rate == pytest.approx(0.1)
+    assert covering.model._n_updates == pytest.approx(covering.num_timesteps / covering.train_freq, abs=covering.env.timeout)
     result = evaluate_pairs(covering, TOY, env_kwargs={"maze_map": CORRIDOR}, n_pairs=5)
     assert len(result.pairs) == 5
 

@@ -1,6 +1,7 @@
 """Deep covering options: skills to the ends of the explored space, composed by SMDP Q-learning (sections 2.3, 4, A.5)."""
 
 import copy
+import sys
 from collections.abc import Callable
 from typing import Any
 
@@ -11,7 +12,7 @@ from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
-from stable_baselines3.common.utils import LinearSchedule
+from stable_baselines3.common.utils import LinearSchedule, polyak_update
 
 from sb3_skillgraph.baselines.goal_conditioned import GoalSchedule
 from sb3_skillgraph.goal_env import GoalSpec
@@ -92,7 +93,7 @@ class CoveringReplay(OptionReplay):
         before, after = self.end.values(here), self.end.values(there)
         there_already, stuck = np.zeros(batch_size, dtype=bool), self.store.stuck(rows)
         # Where the task's own goal ended an episode an option would have gone on.
-        done = (after <= self.end.threshold) | stuck
+        done = (after <= self.end.threshold) | stuck | self.store.terminated(rows)
         pay = self.rule.reward(there_already, done, stuck, here, there, goal) + (before - after) / self.scale
         return ReplayBufferSamples(
             observations=self._tensor(self.view(data["observation"], here, goal)),
@@ -117,13 +118,15 @@ class CoveringOptions:
     :param n_options: number of options; the paper tries 3, 4, 5 and 10
     :param option_freq: episodes between options
     :param goal_freq: episodes per goal
-    :param option_updates: gradient steps when an option is made; later one every ``train_freq`` steps for one of them
+    :param option_updates: gradient steps when an option is made; later they train in turns
     :param reach: steps that the pairs of states lie at most apart that an embedding is learned from
-    :param train_freq: environment steps per gradient step
+    :param train_freq: environment steps after which there is training
+    :param gradient_steps: gradient steps then
     :param batch_size: transitions in a minibatch
     :param gamma: discount factor per environment step
     :param exploration_noise: standard deviation of the noise on options' scaled actions while learning
     :param option_class: SB3 class of the options' policies: ``OptionDDPG`` or ``OptionTD3``
+    :param saturation_penalty: see :class:`~sb3_skillgraph.options.learner.OptionLearner`
     :param shaping: reward of the global option for every success radius of distance gained
     :param seed: of everything random
 
@@ -141,10 +144,12 @@ class CoveringOptions:
         option_updates: int = 5_000,
         reach: int = 60,
         train_freq: int = 2,
+        gradient_steps: int = 1,
         batch_size: int = 128,
         gamma: float = 0.99,
         exploration_noise: float = 0.1,
         option_class: type[OptionDDPG] | type[OptionTD3] = OptionDDPG,
+        saturation_penalty: float = 1e-4,
         shaping: float = 0.0,
         seed: int = 0,
     ) -> None:
@@ -155,6 +160,7 @@ class CoveringOptions:
         self.option_updates = option_updates
         self.reach = reach
         self.train_freq = train_freq
+        self.gradient_steps = gradient_steps
         self.batch_size = batch_size
         self.exploration_noise = exploration_noise
         self.rng = np.random.default_rng(seed)
@@ -168,7 +174,7 @@ class CoveringOptions:
             gamma=gamma,
             actor_learning_rate=1e-3,
             critic_learning_rate=1e-3,
-            saturation_penalty=1e-4,
+            saturation_penalty=saturation_penalty,
             policy_kwargs={"net_arch": [128, 128]},
         )
         self._factory = OptionFactory(
@@ -187,10 +193,10 @@ class CoveringOptions:
             Monitor(self.env),
             learning_rate=1e-3,
             learning_starts=100,
-            batch_size=64,
+            batch_size=batch_size,
+            tau=0.005,
             gamma=gamma,
-            train_freq=1,
-            target_update_interval=500,
+            target_update_interval=sys.maxsize,  # after every update instead
             exploration_fraction=0.75,
             exploration_final_eps=0.1,
             policy_kwargs={"net_arch": [128, 128]},
@@ -270,7 +276,7 @@ class CoveringOptions:
         if self.num_timesteps % self.train_freq == 0 and len(self.store) >= self.batch_size:
             learners = [option.learner for option in (*self.options, self.global_option) if option is not None]
             if learners:
-                learners[self.num_timesteps // self.train_freq % len(learners)].train(1, self.batch_size)
+                learners[self.num_timesteps // self.train_freq % len(learners)].train(self.gradient_steps, self.batch_size)
         self._n_episodes += done
         if done and self._n_episodes >= self._next_option and len(self.options) < self.n_options:
             self._next_option = self._n_episodes + self.option_freq
@@ -336,7 +342,7 @@ class _Recorder(gym.Wrapper):
 
 
 class _Budget(BaseCallback):
-    """Counts environment steps where SB3 counts decisions, and ends learning after so many."""
+    """Tells environment steps where SB3 counts decisions, and ends learning after so many."""
 
     start, total = 0, 1
 
@@ -348,14 +354,28 @@ class _Budget(BaseCallback):
     def share_left(self) -> float:
         return max(0.0, 1.0 - (self.learner.num_timesteps - self.start) / self.total)
 
+    @property
+    def updates_due(self) -> int:
+        return self.learner.num_timesteps // self.learner.train_freq * self.learner.gradient_steps
+
     def _on_step(self) -> bool:
         return self.share_left > 0.0
 
 
 class _QLearning(SMDPQLearning):
-    """Explores less the fewer environment steps are left."""
+    """Counts environment steps, not decisions: of exploration, updates and the target network, which follows softly."""
 
     budget: _Budget
+
+    def train(self, gradient_steps: int, batch_size: int = 100) -> None:
+        """Learn as often as is due after the environment steps of the last decision.
+
+        :param gradient_steps: not used
+        :param batch_size: transitions in a minibatch
+        """
+        for _ in range(self.budget.updates_due - self._n_updates):
+            super().train(1, batch_size)
+            polyak_update(self.q_net.parameters(), self.q_net_target.parameters(), self.tau)
 
     def _update_current_progress_remaining(self, num_timesteps: int, total_timesteps: int) -> None:
         self._current_progress_remaining = self.budget.share_left

@@ -53,6 +53,22 @@ class GoalSchedule(gym.Wrapper):
         return observation, info
 
 
+class EndWhenStuck(gym.Wrapper):
+    """Ends the episode of an agent that can do nothing any more, as the skill graph gives it up.
+
+    :param env: an environment that may tell so in ``info["stuck"]``
+    """
+
+    def step(self, action: np.ndarray) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """Take a step.
+
+        :param action: action of the wrapped environment
+        :return: observation, reward, terminated, truncated and info
+        """
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        return observation, reward, terminated or bool(info.get("stuck")), truncated, info
+
+
 class OptionTask(gym.Wrapper):
     """
     A goal environment that pays as options are paid: -1 a step, 0 at the goal, and for getting stuck, which ends the
@@ -119,7 +135,7 @@ def make_uvfa(env: gym.Env, *, seed: int | None = None, goal_freq: int = 30, **k
     :param goal_freq: episodes per goal
     :param kwargs: arguments of ``stable_baselines3.DDPG`` that differ from ``SETTINGS``
     """
-    return _ddpg(GoalSchedule(env, goal_freq), seed, kwargs)
+    return _ddpg(GoalSchedule(EndWhenStuck(env), goal_freq), seed, kwargs)
 
 
 def make_her(env: gym.Env, *, seed: int | None = None, **kwargs: Any) -> DDPG:
