@@ -107,27 +107,32 @@ class SkillGraphLearner(Learner):
 
     def __init__(self, env_id: str, env_kwargs: dict[str, Any], seed: int, arguments: dict[str, Any]) -> None:
         self.env = gym.make(env_id, **env_kwargs)
-        self.policy: SkillGraphAgent = SkillGraphAgent(env=self.env, seed=seed, **_recommended(env_id, arguments))
+        self.agent = SkillGraphAgent(env=self.env, seed=seed, **_recommended(env_id, arguments))
+
+    @property
+    def policy(self) -> Predictor:  # type: ignore[override]
+        """What is tested."""
+        return self.agent
 
     def learn(self, begin: int, end: int, every: int, check: Check) -> None:
         """Learn from check to check: between two calls of ``learn`` an agent can be saved exactly."""
         for target in [*range(begin + every - begin % every, end, every), end]:
-            self.policy.learn(target - begin, log_interval=None, reset_num_timesteps=False)
+            self.agent.learn(target - begin, log_interval=None, reset_num_timesteps=False)
             begin = target
             check(target)
 
     def save(self, folder: Path) -> None:
         """Save the agent and its experience."""
-        self.policy.save(folder / "agent.zip")
-        self.policy.save_replay_buffer(folder / "experience")
+        self.agent.save(folder / "agent.zip")
+        self.agent.save_replay_buffer(folder / "experience")
 
     def load(self, folder: Path) -> None:
         """Load both."""
-        self.policy = load_agent(folder, self.env)
+        self.agent = load_agent(folder, self.env)
 
     def practise(self, env: gym.Env, start: np.ndarray, goal: np.ndarray, stretches: list[int]) -> Iterator[Predictor]:
         """Adapt a copy; its episodes do not end at the goal."""
-        twin = self.policy.copy(gym.make(self.env.spec))  # type: ignore[arg-type]
+        twin = self.agent.copy(gym.make(self.env.spec))  # type: ignore[arg-type]
         yield twin
         for n_steps in stretches:
             twin.adapt(goal, start=start, total_timesteps=n_steps)
@@ -135,17 +140,44 @@ class SkillGraphLearner(Learner):
 
     def summary(self) -> dict[str, float]:
         """Describe the graph."""
-        return {f"skillgraph/{name}": value for name, value in self.policy.graph_summary().items()}
+        return {f"skillgraph/{name}": value for name, value in self.agent.graph_summary().items()}
 
     def snapshot(self) -> dict[str, Any]:
         """Return events and what joins them."""
-        graph = self.policy.graph
+        graph = self.agent.graph
         numbers = {id: i for i, id in enumerate(graph.events)}
         links = near_links(event_links(graph))
         return {
             "centers": [event.center.tolist() for event in graph.events.values()],
             "links": [[numbers[link.source], numbers[link.target]] for link in links],
         }
+
+
+class PlanningOffLearner(SkillGraphLearner):
+    """The same, tested with planning off: its global option walks straight to every goal."""
+
+    @property
+    def policy(self) -> Predictor:  # type: ignore[override]
+        """What is tested."""
+        return _PlanningOff(self.agent)
+
+    def practise(self, env: gym.Env, start: np.ndarray, goal: np.ndarray, stretches: list[int]) -> Iterator[Predictor]:
+        """Adapt a copy."""
+        for twin in super().practise(env, start, goal, stretches):
+            assert isinstance(twin, SkillGraphAgent)
+            yield _PlanningOff(twin)
+
+
+class _PlanningOff:
+    def __init__(self, agent: SkillGraphAgent) -> None:
+        self.agent = agent
+
+    def predict(self, *args: Any, **kwargs: Any) -> Any:
+        self.agent.planning = False
+        try:
+            return self.agent.predict(*args, **kwargs)
+        finally:
+            self.agent.planning = True  # for what it learns from later
 
 
 def _checking(every: int, end: int, check: Check) -> Check:
@@ -285,6 +317,7 @@ class RandomWalkLearner(Learner):
 
 ALGORITHMS: dict[str, type[Learner]] = {
     "skill_graph": SkillGraphLearner,
+    "planning_off": PlanningOffLearner,
     "uvfa": UVFALearner,
     "her": HERLearner,
     "recipe": RecipeLearner,

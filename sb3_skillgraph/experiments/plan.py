@@ -80,7 +80,7 @@ def load_plan(path: Path) -> list[RunSpec]:
         if method["algorithm"] not in ALGORITHMS:
             hint = did_you_mean(method["algorithm"], ALGORITHMS)
             raise ValueError(f"{path}, method {name!r}: unknown algorithm {method['algorithm']!r}{hint}.")
-        if method["algorithm"] in ("skill_graph", "recipe"):
+        if method["algorithm"] in ("skill_graph", "planning_off", "recipe"):
             check_hyperparams(method.get("arguments", {}), f"{path}, method {name!r}")
     environments = {
         str(name): _checked(value, _ENVIRONMENT, f"{path}, environment {name!r}", required=("id", "steps"))
