@@ -35,7 +35,7 @@ SMALL_NETS = {
 
 
 def spec(algorithm: str = "skill_graph", steps: int = 600, **changes: Any) -> RunSpec:
-    arguments = SMALL_NETS if algorithm == "skill_graph" else {}
+    arguments = SMALL_NETS if algorithm in ("skill_graph", "planning_off") else {}
     values: dict[str, Any] = dict(check_every=200, pairs=3, final_pairs=4, arguments=arguments, seed=0, test_pairs=0)
     return RunSpec(algorithm, "toy", algorithm=algorithm, env_id=TOY, steps=steps, **{**values, **changes})
 
@@ -61,7 +61,7 @@ def plan(path: Path, **changes: Any) -> Path:
 # -- one run ----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("algorithm", ["skill_graph", "uvfa", "her", "covering_options", "random_walk"])
+@pytest.mark.parametrize("algorithm", ["skill_graph", "planning_off", "uvfa", "her", "covering_options", "random_walk"])
 def test_a_run_leaves_everything_and_is_not_done_again(algorithm: str, tmp_path: Path) -> None:
     arguments = {"covering_options": {"n_options": 2, "option_updates": 20}}
     changes = {"arguments": arguments[algorithm]} if algorithm in arguments else {}
@@ -213,28 +213,49 @@ def test_on_ray(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         ray.shutdown()
 
 
+def test_on_dask(tmp_path: Path) -> None:
+    specs = load_plan(plan(tmp_path / "plan.yml", methods={"walk": {"algorithm": "random_walk"}}))
+    assert compare(specs, tmp_path / "runs", n_jobs=2, backend="dask") == ["done"] * 2
+
+
 WORKER = """
 import os, signal, sys
 from pathlib import Path
 from sb3_skillgraph.agent import SkillGraphAgent
-from sb3_skillgraph.experiments import compare, load_plan
+from sb3_skillgraph.experiments import compare, load_plan, runner
 
-store, left = SkillGraphAgent._store_transition, int(sys.argv[3])
+plan, out, place, left = Path(sys.argv[1]), Path(sys.argv[2]), sys.argv[3], int(sys.argv[4])
 
-def killed_in_time(self, *arguments):
-    global left
-    left -= 1
-    if left == 0:
-        os.kill(os.getpid(), signal.SIGKILL)
-    store(self, *arguments)
+def killed_in_time(call):
+    def counted(*arguments, **kwargs):
+        global left
+        left -= 1
+        if left == 0:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return call(*arguments, **kwargs)
+    return counted
 
-SkillGraphAgent._store_transition = killed_in_time
-compare(load_plan(Path(sys.argv[1])), Path(sys.argv[2]))
+owner, name = {
+    "step": (SkillGraphAgent, "_store_transition"),
+    "test": (SkillGraphAgent, "act"),
+    "write": (os, "fsync"),
+    "save": (SkillGraphAgent, "save_replay_buffer"),
+}[place]
+setattr(owner, name, killed_in_time(getattr(owner, name)))
+do = runner._Run.do
+
+def noted(self):
+    with (out / "begun.txt").open("a") as file:
+        file.write(f"{self.folder.name}\\n")
+    do(self)
+
+runner._Run.do = noted
+compare(load_plan(plan), out)
 """
 
 
-def work(plan_file: Path, out: Path, steps_to_live: int = 0) -> subprocess.Popen[bytes]:
-    command = [sys.executable, "-c", WORKER, str(plan_file), str(out), str(steps_to_live)]
+def work(plan_file: Path, out: Path, place: str = "step", calls_to_live: int = 0) -> subprocess.Popen[bytes]:
+    command = [sys.executable, "-c", WORKER, str(plan_file), str(out), place, str(calls_to_live)]
     return subprocess.Popen(command, env={**os.environ, "OMP_NUM_THREADS": "1"})
 
 
@@ -243,13 +264,20 @@ def test_killed_at_any_moment_it_comes_to_the_same_and_two_workers_share(tmp_pat
     file = plan(tmp_path / "plan.yml", methods=methods, environments={"toy": {"id": TOY, "steps": 700}}, check_every=100)
     specs, alone, shared = load_plan(file), tmp_path / "alone", tmp_path / "shared"
     compare(specs, alone)
-    for steps_to_live in np.random.default_rng(0).integers(120, 300, 5).tolist():
-        assert work(file, shared, steps_to_live).wait() == -signal.SIGKILL
-    assert {s.state for s in status(specs, shared)} != {"done"}
+    shared.mkdir()
+    steps = np.random.default_rng(0).integers(120, 300, 3).tolist()
+    deaths = [*(("step", n) for n in steps), ("write", 2), ("save", 2), ("test", 150)]
+    for place, calls_to_live in deaths:
+        assert work(file, shared, place, calls_to_live).wait() == -signal.SIGKILL
+    unfinished = [s.spec.folder(shared).name for s in status(specs, shared) if s.state != "done"]
+    assert unfinished
+    (shared / "begun.txt").unlink()
     workers = [work(file, shared) for _ in range(2)]
     assert [worker.wait() for worker in workers] == [0, 0]
+    assert sorted((shared / "begun.txt").read_text().split()) == unfinished  # each by one of them
     for s in specs:
         assert (s.folder(shared) / "done.json").exists()
+        assert not (s.folder(shared) / "error.txt").exists()
         assert progress(s.folder(shared)) == progress(s.folder(alone))
 
 
@@ -279,10 +307,15 @@ def test_a_plan_that_is_no_yaml(tmp_path: Path) -> None:
         load_plan(tmp_path / "plan.yml")
 
 
-def test_an_unknown_backend_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "ray.util.joblib", None)
-    with pytest.raises(ValueError, match="pip install ray"):
-        compare([], tmp_path, backend="ray")
+@pytest.mark.parametrize(
+    ("backend", "module", "package"), [("ray", "ray.util.joblib", "ray"), ("dask",) + ("distributed",) * 2]
+)
+def test_an_unknown_backend_says_what_to_install(
+    backend: str, module: str, package: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(ValueError, match=f"pip install {package}"):
+        compare([], tmp_path, backend=backend)
 
 
 # -- estimates and figures --------------------------------------------------------------------------------------------
@@ -305,7 +338,8 @@ def test_interquartile_mean_and_its_interval() -> None:
 def runs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     folder = tmp_path_factory.mktemp("compare")
     methods = {
-        "frontier": {"algorithm": "skill_graph", "arguments": SMALL_NETS},
+        # So that chains have several options, for Figure 8.
+        "frontier": {"algorithm": "skill_graph", "arguments": {**SMALL_NETS, "evidence_edges": False, "option_timeout": 15}},
         "dco": {"algorithm": "skill_graph", "arguments": {**SMALL_NETS, "salience": "dco", "retry_after": 50}},
         "walk": {"algorithm": "random_walk"},
     }
@@ -317,7 +351,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     return file, folder / "runs"
 
 
-@pytest.mark.parametrize("number", [3, 4, 5, 6, 7, 9])
+@pytest.mark.parametrize("number", [3, 4, 5, 6, 7, 8, 9])
 def test_figures_of_the_paper(number: int, runs: tuple[Path, Path], tmp_path: Path) -> None:
     file, out = runs
     picture = tmp_path / "figure.png"

@@ -104,9 +104,10 @@ def test_in_the_middle_of_gestation(tmp_path: Path) -> None:
         dict(train_freq=4, gradient_steps=2),
         dict(option_class=TD3),
         dict(option_class=SAC),
+        dict(salience="dco", salient_event_freq=2),
         dict({k: v for k, v in PAPER.items() if k not in ("batch_size", "policy_kwargs")}, salient_event_freq=2),
     ],
-    ids=["train_freq", "TD3", "SAC", "PAPER"],
+    ids=["train_freq", "TD3", "SAC", "dco", "PAPER"],
 )
 def test_with_other_arguments(tmp_path: Path, kwargs: dict[str, Any]) -> None:
     expected = state_of(new_agent(learning_starts=50, **kwargs).learn(402))

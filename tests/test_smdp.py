@@ -1,5 +1,6 @@
 """Options as actions: the lifted environment, planning and Q-learning on it."""
 
+import copy
 from typing import Any
 
 import gymnasium as gym
@@ -388,7 +389,10 @@ def test_q_learning_without_masks_and_what_it_refuses() -> None:
 
 def test_maskable_ppo_trains_on_it(agent: SkillGraphAgent) -> None:
     env = Monitor(lifted(agent))
-    model = MaskablePPO("MultiInputPolicy", env, n_steps=64, batch_size=32, n_epochs=2, seed=0).learn(128)
+    model = MaskablePPO("MultiInputPolicy", env, n_steps=64, batch_size=32, n_epochs=2, seed=0)
+    before = copy.deepcopy(model.policy.state_dict())
+    model.learn(128)
+    assert any(not th.equal(before[name], value) for name, value in model.policy.state_dict().items())
     observation, _ = env.reset(seed=0)
     action, _ = model.predict(observation, action_masks=env.get_wrapper_attr("action_masks")())
     assert observation["action_mask"][int(action)]

@@ -9,6 +9,7 @@ import time
 import traceback
 from collections.abc import Sequence
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -34,8 +35,8 @@ class RunStatus(NamedTuple):
 
     :param spec: the run
     :param state: ``done``, ``running``, ``failed``, ``stopped`` (to be resumed) or ``waiting``
-    :param steps: environment steps whose results are on disk
-    :param seconds_left: estimate; None before the first check
+    :param steps: environment steps done, those that will not have to be done again
+    :param seconds_left: estimate, without tests; None before the first check
     :param success_rate: last measured; None before the first check
     """
 
@@ -52,13 +53,12 @@ def compare(specs: Sequence[RunSpec], out: Path, n_jobs: int = 1, backend: str =
     :param specs: the runs
     :param out: folder for all of them; other workers may be at work in it
     :param n_jobs: runs at a time
-    :param backend: joblib's: ``loky``, ``ray`` or ``dask``, which bring their own clusters
+    :param backend: joblib's: ``loky``, ``ray`` or ``dask``, which bring their own clusters; Dask's is that of the current
+        client or of Dask's configuration, else one on this machine
     :return: what became of each
     :raises ValueError: if the backend is not installed
     """
-    if backend == "ray":
-        _register_ray()
-    with parallel_config(backend=backend, n_jobs=n_jobs):
+    with _engine(backend, n_jobs), parallel_config(backend=backend, n_jobs=n_jobs):
         outcomes = _do(specs, out)
         # Whoever was at work elsewhere may have been killed meanwhile.
         left = [i for i, outcome in enumerate(outcomes) if outcome == "elsewhere"]
@@ -68,24 +68,42 @@ def compare(specs: Sequence[RunSpec], out: Path, n_jobs: int = 1, backend: str =
 
 
 def _do(specs: Sequence[RunSpec], out: Path) -> list[Outcome]:
-    before = -1
+    furthest = -1
     while True:
-        n_done = sum((spec.folder(out) / DONE).exists() for spec in specs)
         try:
             return list(Parallel(batch_size=1, pre_dispatch="n_jobs")(delayed(run)(spec, out) for spec in specs))
         except BrokenProcessPool:
-            # A worker was killed, and joblib has ended the others: go on, unless that is all that ever happens.
-            if n_done == before:
+            # A worker was killed, and joblib has ended the others: go on, unless nothing gets any further.
+            reached = sum(each.steps + (each.state == "done") for each in status(specs, out))
+            if reached <= furthest:
                 raise
-            before = n_done
+            furthest = reached
 
 
-def _register_ray() -> None:
+def _engine(backend: str, n_jobs: int) -> AbstractContextManager[Any]:
+    """Get joblib's backend ready: Ray's registers itself, Dask's wants a client while it is used."""
     try:
-        from ray.util.joblib import register_ray  # type: ignore[import-not-found, unused-ignore]
+        if backend == "ray":
+            from ray.util.joblib import register_ray  # type: ignore[import-not-found, unused-ignore]
+
+            register_ray()
+        if backend == "dask":
+            return _dask_client(n_jobs)
     except ImportError as error:
-        raise ValueError("The backend ray needs Ray: pip install ray.") from error
-    register_ray()
+        package = {"ray": "ray", "dask": "distributed"}[backend]
+        raise ValueError(f"The backend {backend} needs its package: pip install {package}.") from error
+    return nullcontext()
+
+
+def _dask_client(n_jobs: int) -> AbstractContextManager[Any]:
+    from distributed import Client, get_client  # type: ignore[import-not-found, unused-ignore]
+
+    try:
+        return nullcontext(get_client())
+    except ValueError:
+        # Of the scheduler that Dask's configuration names, or of this machine; runs must not share their generators.
+        client: AbstractContextManager[Any] = Client(n_workers=n_jobs, threads_per_worker=1, dashboard_address=None)
+        return client
 
 
 def run(spec: RunSpec, out: Path) -> Outcome:
@@ -297,12 +315,16 @@ def _status(spec: RunSpec, folder: Path) -> RunStatus:
     rate = float(rows[-1]["eval/success_rate"]) if rows else None
     if (folder / DONE).exists():
         return RunStatus(spec, "done", steps, 0.0, rate)
-    left = float(rows[-1][SECONDS]) / steps * (spec.steps - steps) if rows else None
+    # At test time copies learn with each pair; what does not resume begins anew.
+    total = spec.steps + spec.test_pairs * spec.test_stretches * STRETCH
+    a_step = float(rows[-1][SECONDS]) / steps if rows else None
     if _is_locked(folder):
-        return RunStatus(spec, "running", steps, left, rate)
+        return RunStatus(spec, "running", steps, a_step and a_step * (total - steps), rate)
+    kept = max(checkpoints(folder), default=0)
+    left = a_step and a_step * (total - kept)
     if (folder / ERROR).exists():
-        return RunStatus(spec, "failed", steps, left, rate)
-    return RunStatus(spec, "stopped" if (folder / CONFIG).exists() else "waiting", steps, left, rate)
+        return RunStatus(spec, "failed", kept, left, rate)
+    return RunStatus(spec, "stopped" if (folder / CONFIG).exists() else "waiting", kept, left, rate)
 
 
 def _is_locked(folder: Path) -> bool:
