@@ -1,4 +1,4 @@
-"""Sum up the finished runs of a plan: a CSV, and the README's table.
+"""Sum up the finished runs of a plan: two CSVs, and the README's tables: every method, and the order that the paper reports.
 
 python -m benchmarks.compare_table benchmarks/compare.yml benchmarks/results/compare
 """
@@ -6,13 +6,29 @@ python -m benchmarks.compare_table benchmarks/compare.yml benchmarks/results/com
 import argparse
 import csv
 import pathlib
+import warnings
 from typing import Any
 
 import numpy as np
+from scipy.stats import ttest_ind
 
 from sb3_skillgraph.experiments.plan import RunSpec, load_plan
 from sb3_skillgraph.experiments.runner import status
 from sb3_skillgraph.experiments.summary import estimate
+
+# What Figure 5 of the paper shows, and what it leaves open: is it the planning, or hindsight, or events?
+ORDER = [
+    ("dsg-rrt", "dsg-dco"),
+    ("dsg-dco", "uvfa"),
+    ("dsg-dco", "dco-10"),
+    ("dsg-frontier", "dsg-rrt"),
+    ("dsg-frontier", "ddpg-her"),
+    ("dsg-frontier", "td3-her-recipe"),
+    ("dsg-frontier", "td3-her-recipe-body"),
+    ("dsg-frontier", "global-option"),
+    ("dsg-frontier", "global-option-ways"),
+    ("dco-10", "random-walk"),
+]
 
 
 def summarise(specs: list[RunSpec], out: pathlib.Path) -> list[dict[str, Any]]:
@@ -41,6 +57,49 @@ def summarise(specs: list[RunSpec], out: pathlib.Path) -> list[dict[str, Any]]:
     return sorted(rows, key=lambda row: (order.index(row["environment"]), -row["mean"]))
 
 
+def compare(specs: list[RunSpec], out: pathlib.Path) -> list[dict[str, Any]]:
+    """Return a row for every pair of methods whose order is asked for: the difference of means with Welch's 95 % interval."""
+    scores: dict[tuple[str, str], list[float]] = {}
+    for run in status(specs, out):
+        if run.state == "done" and run.success_rate is not None:
+            scores.setdefault((run.spec.environment, run.spec.method), []).append(run.success_rate)
+    rows = []
+    for environment in dict.fromkeys(environment for environment, _ in scores):
+        for better, worse in ORDER:
+            a, b = scores.get((environment, better), []), scores.get((environment, worse), [])
+            if min(len(a), len(b)) < 2:
+                continue
+            difference = low = high = float(np.mean(a) - np.mean(b))
+            if np.ptp(a) or np.ptp(b):
+                with warnings.catch_warnings():
+                    warnings.simplefilter("ignore", RuntimeWarning)  # that all seeds of one of them agree
+                    low, high = ttest_ind(a, b, equal_var=False).confidence_interval()
+            row = dict(environment=environment, better=better, worse=worse, difference=difference, low=low, high=high)
+            rows.append({**row, "seeds": f"{len(a)}, {len(b)}"})
+    return rows
+
+
+def compared_line(row: dict[str, Any]) -> str:
+    """Return a row of the second table in Markdown."""
+    numbers = f"{row['difference']:+.3f} ({row['low']:+.3f} to {row['high']:+.3f})"
+    verdict = "yes" if row["low"] > 0 else "no, the reverse" if row["high"] < 0 else "not told apart"
+    cells = [row["environment"], f"`{row['better']}` over `{row['worse']}`", numbers, row["seeds"], verdict]
+    return f"| {' | '.join(cells)} |"
+
+
+def write(path: pathlib.Path, rows: list[dict[str, Any]]) -> None:
+    """Write rows as CSV, numbers to four digits."""
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows({k: round(v, 4) if isinstance(v, float) else v for k, v in row.items()} for row in rows)
+
+
+def table(columns: list[str], lines: list[str]) -> str:
+    """Return a table in Markdown."""
+    return "\n".join([f"| {' | '.join(columns)} |", "|---" * len(columns) + "|", *lines])
+
+
 def line(row: dict[str, Any]) -> str:
     """Return a row in Markdown."""
     cells = [
@@ -56,20 +115,23 @@ def line(row: dict[str, Any]) -> str:
 
 
 def main() -> None:
-    """Write ``summary.csv`` into the folder and print the table."""
+    """Write ``PLAN_summary.csv`` and ``PLAN_order.csv`` into the folder and print the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("plan", type=pathlib.Path)
     parser.add_argument("out", type=pathlib.Path, help="folder of all runs")
     args = parser.parse_args()
-    rows = summarise(load_plan(args.plan), args.out)
+    specs = load_plan(args.plan)
+    rows, compared = summarise(specs, args.out), compare(specs, args.out)
     if not rows:
         raise SystemExit(f"no run of {args.plan} is finished in {args.out}")
-    with (args.out / "summary.csv").open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows({k: round(v, 4) if isinstance(v, float) else v for k, v in row.items()} for row in rows)
-    columns = ("Task", "Steps", "Method", "Mean", "IQM (95 %)", "Seeds' range", "Seeds")
-    print("\n".join([f"| {' | '.join(columns)} |", "|---" * len(columns) + "|", *map(line, rows)]))
+    write(args.out / f"{args.plan.stem}_summary.csv", rows)
+    print(table(["Task", "Steps", "Method", "Mean", "IQM (95 %)", "Seeds' range", "Seeds"], [*map(line, rows)]))
+    if compared:
+        write(args.out / f"{args.plan.stem}_order.csv", compared)
+        print()
+        print(
+            table(["Task", "Is better", "Difference of means (95 %)", "Seeds", "Told apart"], [*map(compared_line, compared)])
+        )
 
 
 if __name__ == "__main__":
