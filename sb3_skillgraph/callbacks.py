@@ -14,14 +14,22 @@ class SkillGraphProgressBarCallback(ProgressBarCallback):
     """SB3's progress bar that also shows events, mature options, edges and coverage.
 
     *Coverage* is the share of visited states from which some vertex of the graph can be entered.
+
+    :param until: total number of steps at which the bar is full, over several calls of ``learn``; None for the end of one
     """
 
     model: Any  # a SkillGraphAgent: SB3 declares its own base class, which has no graph
 
+    def __init__(self, until: int | None = None) -> None:
+        super().__init__()
+        self.until = until
+
     def _on_training_start(self) -> None:
+        if self.until is not None and hasattr(self, "pbar"):
+            return
         # Fewer columns than tqdm's own, so that everything fits on a line of 80 characters.
         columns = ("{task.percentage:>3.0f}%", BarColumn(None), TimeElapsedColumn(), "<", TimeRemainingColumn())
-        total = self.locals["total_timesteps"] - self.model.num_timesteps
+        total = (self.until or self.locals["total_timesteps"]) - self.model.num_timesteps
         self.pbar = tqdm(total=total, progress=("{task.description}", *columns))
         self._next_refresh = self.num_timesteps
         self._describe()
@@ -40,7 +48,8 @@ class SkillGraphProgressBarCallback(ProgressBarCallback):
 
     def _on_training_end(self) -> None:
         self._describe()
-        super()._on_training_end()
+        if self.until is None or self.num_timesteps >= self.until:
+            super()._on_training_end()
 
     def close(self) -> None:
         """Give the terminal back when learning was interrupted: SB3 then does not end its callbacks."""

@@ -1,7 +1,6 @@
 """The command line: ``sb3-skillgraph train | evaluate | plot | demo | compare | status | figure``."""
 
 import argparse
-import json
 import sys
 from collections.abc import Sequence
 from importlib.metadata import version
@@ -13,18 +12,17 @@ import numpy as np
 import torch as th
 from rich.console import Console
 from rich.table import Table
-from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.logger import configure
 
 import sb3_skillgraph.envs  # noqa: F401 - registers the environments
 from sb3_skillgraph.agent import SkillGraphAgent
 from sb3_skillgraph.baselines import RandomWalk
-from sb3_skillgraph.callbacks import SkillGraphProgressBarCallback
-from sb3_skillgraph.console import UserError, assignment, for_people, positive, versions
+from sb3_skillgraph.console import UserError, assignment, for_people, positive
 from sb3_skillgraph.evaluation import PairsResult, evaluate_pairs
 from sb3_skillgraph.experiments.commands import add_compare, add_figure, add_status
 from sb3_skillgraph.hyperparams import check_hyperparams, did_you_mean, load_hyperparams
 from sb3_skillgraph.plotting import plot_plan, plot_skill_graph, run_plan, save_figure
+from sb3_skillgraph.run_folder import checkpoints
+from sb3_skillgraph.training import AGENT, train, write_json
 
 DEMO_ENV, DEMO_STEPS, DEMO_PAIRS = "SkillGraph/PointMazeMedium-v0", 100_000, 100
 USER_ERROR, INTERRUPTED = 2, 130
@@ -88,7 +86,8 @@ def _add_train(commands: Any) -> None:
         _train,
         "Train an agent on a goal environment, without reward.",
         "Arguments of the agent come from its signature, then from the environment's entry in hyperparams/*.yml, then\n"
-        "from --hyperparams. OUT receives agent.zip, progress.csv and config.json. Ctrl-C saves the agent, too.\n\n"
+        "from --hyperparams. OUT receives agent.zip, progress.csv and config.json. Ctrl-C saves the agent, too. However\n"
+        "it was interrupted, the same command goes on from the last checkpoint, and comes to the same as in one go.\n\n"
         "example:\n  sb3-skillgraph train SkillGraph/PointMazeUMaze-v0 --steps 50000 --out runs/umaze\n"
         "  sb3-skillgraph train SkillGraph/ToyMaze-v0 --hyperparams salience=rrt policy_kwargs='{net_arch: [64, 64]}'",
     )
@@ -163,50 +162,15 @@ def _add_demo(commands: Any) -> None:
 def _train(args: argparse.Namespace) -> int:
     _check_env_id(args.env)
     out = args.out or Path("runs") / f"{args.env.rpartition('/')[2]}-seed{args.seed}"
-    if (out / "agent.zip").exists():
+    if (out / AGENT).exists() and not checkpoints(out):
         raise UserError(f"{out} holds an agent already; give another folder with --out, or remove it.")
     with for_people():
         given = check_hyperparams(dict(args.hyperparams), "--hyperparams")
         hyperparams = {**load_hyperparams(args.env), **given}
-    steps = args.steps or int(hyperparams["n_timesteps"])
-    env_kwargs = dict(args.env_kwargs)
-    _learn(args.env, env_kwargs, hyperparams, steps, args.seed, out, args.n_envs, args.device, args.verbose)
+    recommended = int(hyperparams.pop("n_timesteps"))
+    env_kwargs, steps = dict(args.env_kwargs), args.steps or recommended
+    train(args.env, env_kwargs, hyperparams, steps, args.seed, out, args.n_envs, args.device, args.verbose)
     return 0
-
-
-def _learn(
-    env_id: str,
-    env_kwargs: dict[str, Any],
-    hyperparams: dict[str, Any],
-    steps: int,
-    seed: int,
-    out: Path,
-    n_envs: int = 1,
-    device: str = "auto",
-    verbose: bool = False,
-) -> SkillGraphAgent:
-    """Train, and leave agent, log and configuration in a folder; Ctrl-C saves what there is and is raised again."""
-    arguments = {name: value for name, value in hyperparams.items() if name != "n_timesteps"}
-    with for_people():
-        env = make_vec_env(env_id, n_envs=n_envs, env_kwargs=env_kwargs)
-    try:
-        with for_people():
-            agent = SkillGraphAgent(env=env, seed=seed, **{"device": device, **arguments})
-        out.mkdir(parents=True, exist_ok=True)
-        config = dict(env=env_id, env_kwargs=env_kwargs, steps=steps, seed=seed, n_envs=n_envs, arguments=arguments)
-        _write_json(out / "config.json", {**config, "versions": versions()})
-        agent.set_logger(configure(str(out), ["csv", "stdout"] if verbose else ["csv"]))
-        bar = SkillGraphProgressBarCallback()
-        try:
-            agent.learn(steps, callback=bar)
-        finally:
-            bar.close()
-            agent.logger.close()
-            agent.save(out / "agent.zip")
-            print(f"{agent.num_timesteps} steps; the agent is in {out / 'agent.zip'}, its log in {out / 'progress.csv'}")
-        return agent
-    finally:
-        env.close()
 
 
 def _evaluate(args: argparse.Namespace) -> int:
@@ -224,7 +188,7 @@ def _evaluate(args: argparse.Namespace) -> int:
         env.close()
     _print_table(args.env, {str(args.agent): result})
     if args.out is not None:
-        _write_json(args.out, _as_plain(result))
+        write_json(args.out, _as_plain(result))
         print(f"every pair is in {args.out}")
     return 0
 
@@ -242,7 +206,9 @@ def _plot(args: argparse.Namespace) -> int:
 
 def _demo(args: argparse.Namespace) -> int:
     print(f"Learning {DEMO_ENV} for {args.steps} steps without reward; then {args.pairs} random pairs of start and goal.")
-    agent = _learn(DEMO_ENV, {}, load_hyperparams(DEMO_ENV), args.steps, args.seed, args.out)
+    hyperparams = load_hyperparams(DEMO_ENV)
+    del hyperparams["n_timesteps"]
+    agent = train(DEMO_ENV, {}, hyperparams, args.steps, args.seed, args.out)
     results = {}
     for name, planning in (("skill graph", True), ("planning off", False)):
         agent.planning = planning
@@ -252,7 +218,7 @@ def _demo(args: argparse.Namespace) -> int:
     walk = RandomWalk(agent.action_space, args.seed)
     results["random walk"] = evaluate_pairs(walk, DEMO_ENV, n_pairs=args.pairs, seed=args.seed)
     _print_table(DEMO_ENV, results)
-    _write_json(args.out / "results.json", {name: _as_plain(result) for name, result in results.items()})
+    write_json(args.out / "results.json", {name: _as_plain(result) for name, result in results.items()})
     # The longest way that succeeded shows the most; failing all, the longest.
     shown = max(results["skill graph"].pairs, key=lambda pair: (pair.success, pair.path_length))
     env = _make_env(DEMO_ENV, {})
@@ -325,12 +291,6 @@ def _as_plain(result: PairsResult) -> dict[str, Any]:
         "mean_steps": _mean_steps(result),
         "pairs": [{**pair._asdict(), "start": pair.start.tolist(), "goal": pair.goal.tolist()} for pair in result.pairs],
     }
-
-
-def _write_json(path: Path, document: dict[str, Any]) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    # Classes, such as option_class, by their names.
-    path.write_text(json.dumps(document, indent=2, default=lambda item: getattr(item, "__name__", str(item))) + "\n")
 
 
 def main(argv: Sequence[str] | None = None) -> int:

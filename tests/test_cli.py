@@ -4,12 +4,14 @@ from pathlib import Path
 
 import pytest
 import yaml
+from conftest import differences, state_of, without_clock
 
-from sb3_skillgraph import SkillGraphAgent, cli
+from sb3_skillgraph import SkillGraphAgent, cli, training
 from sb3_skillgraph.callbacks import SkillGraphProgressBarCallback
 from sb3_skillgraph.envs import _TASKS
 from sb3_skillgraph.hyperparams import FILE, load_hyperparams
 from sb3_skillgraph.options.learner import OptionTD3
+from sb3_skillgraph.run_folder import checkpoints, read_progress
 
 TOY = "SkillGraph/ToyMaze-v0"
 
@@ -64,9 +66,52 @@ class TestTrain:
         assert "interrupted" in captured.err and "agent.zip" in captured.out
         assert SkillGraphAgent.load(tmp_path / "agent.zip").num_timesteps == 120
 
+    def test_an_interrupted_run_goes_on_and_comes_to_the_same(self, tmp_path, capsys, monkeypatch):
+        monkeypatch.setattr(training, "CHECKPOINT_EVERY", 200)
+        alone, broken = tmp_path / "alone", tmp_path / "broken"
+        command = [
+            "train",
+            TOY,
+            "--steps",
+            "700",
+            "--hyperparams",
+            "learning_starts=100",
+            "--env-kwargs",
+            "max_steps=50",
+            "--out",
+        ]
+        assert cli.main([*command, str(alone)]) == 0
+        assert list(checkpoints(alone)) == []
+
+        def interrupt(self):
+            if self.num_timesteps == 530:
+                raise KeyboardInterrupt
+            return True
+
+        with monkeypatch.context() as patch:
+            patch.setattr(SkillGraphProgressBarCallback, "_on_step", interrupt)
+            assert cli.main([*command, str(broken)]) == 130
+        assert "the same command goes on after 400 steps" in capsys.readouterr().out
+        assert "unfinished run with other settings" in error_line(capsys, [*command, str(broken), "--seed", "1"])
+        assert cli.main([*command, str(broken)]) == 0
+        assert "going on after 400 steps" in capsys.readouterr().out
+        assert list(checkpoints(broken)) == []
+        logs = [
+            [
+                {name: value for name, value in row.items() if name not in ("time/fps", "time/time_elapsed")}
+                for row in read_progress(out)
+            ]
+            for out in (alone, broken)
+        ]
+        assert len(logs[0]) >= 3
+        assert logs[0] == logs[1]
+        a, b = (SkillGraphAgent.load(out / "agent.zip") for out in (alone, broken))
+        assert differences(without_clock(state_of(a)), without_clock(state_of(b))) == []
+        assert "holds an agent already" in error_line(capsys, [*command, str(broken)])
+
     def test_takes_steps_from_yaml_and_names_the_folder(self, tmp_path, monkeypatch):
         calls = []
-        monkeypatch.setattr(cli, "_learn", lambda *args: calls.append(args))
+        monkeypatch.setattr(cli, "train", lambda *args: calls.append(args))
         monkeypatch.chdir(tmp_path)
         assert cli.main(["train", "SkillGraph/AntUMaze-v0", "--hyperparams", "gamma=0.9"]) == 0
         _, _, hyperparams, steps, seed, out, *_ = calls[0]

@@ -20,8 +20,8 @@ from imageio.v3 import imread
 from sb3_skillgraph.cli import main
 from sb3_skillgraph.experiments import RunSpec, compare, load_plan, run, runner, status
 from sb3_skillgraph.experiments.figures import method_curves, practice_curves
-from sb3_skillgraph.experiments.runner import checkpoints, read_progress
 from sb3_skillgraph.experiments.summary import estimate, interquartile_mean
+from sb3_skillgraph.run_folder import checkpoints, read_progress
 
 SMALL_NETS = {
     "policy_kwargs": {"net_arch": [16, 16]},
@@ -94,15 +94,15 @@ class Killed(BaseException):
 def test_a_run_goes_on_where_its_checkpoint_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     alone, interrupted = tmp_path / "alone", tmp_path / "interrupted"
     assert run(spec(), alone) == "done"
-    save = runner._Run._save
+    take = runner.take_checkpoint
 
-    def killed_before(self: Any, n_steps: int) -> None:
+    def killed_before(folder: Path, n_steps: int, save: Any) -> None:
         if n_steps == 400:
             raise Killed
-        save(self, n_steps)
+        take(folder, n_steps, save)
 
     with monkeypatch.context() as patch:
-        patch.setattr(runner._Run, "_save", killed_before)
+        patch.setattr(runner, "take_checkpoint", killed_before)
         with pytest.raises(Killed):
             run(spec(), interrupted)
     folder = spec().folder(interrupted)

@@ -12,11 +12,11 @@ from matplotlib.axes import Axes
 from sb3_skillgraph.agent import SkillGraphAgent
 from sb3_skillgraph.baselines import RandomWalk
 from sb3_skillgraph.envs import MazeGeometry
-from sb3_skillgraph.experiments.learners import load_agent
 from sb3_skillgraph.experiments.plan import RunSpec
-from sb3_skillgraph.experiments.runner import DONE, STEPS, STRETCH, checkpoints, read_progress
+from sb3_skillgraph.experiments.runner import DONE, STRETCH
 from sb3_skillgraph.experiments.summary import estimate
 from sb3_skillgraph.plotting import paper_figures as draw
+from sb3_skillgraph.run_folder import STEPS, checkpoints, load_agent, read_progress
 from sb3_skillgraph.salience.dco import learn_fiedler
 
 SHARES = (0.1, 0.3, 0.6, 1.0)  # of the run, at which it is looked at

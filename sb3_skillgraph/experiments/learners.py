@@ -19,6 +19,7 @@ from sb3_skillgraph.evaluation import Predictor
 from sb3_skillgraph.hyperparams import check_hyperparams, load_hyperparams
 from sb3_skillgraph.options.learner import OptionDDPG, OptionTD3
 from sb3_skillgraph.plotting import event_links, near_links
+from sb3_skillgraph.run_folder import load_agent, save_agent
 
 Check = Callable[[int], None]
 _COVERING_CLASSES = {"OptionDDPG": OptionDDPG, "OptionTD3": OptionTD3}
@@ -82,17 +83,6 @@ class Learner(ABC):
         return None
 
 
-def load_agent(folder: Path, env: gym.Env) -> SkillGraphAgent:
-    """Load an agent and its experience.
-
-    :param folder: a checkpoint of a skill graph's run
-    :param env: the environment it is to go on in
-    """
-    agent = SkillGraphAgent.load(folder / "agent.zip", env=env)
-    agent.load_replay_buffer(folder / "experience")
-    return agent
-
-
 def _recommended(env_id: str, arguments: dict[str, Any]) -> dict[str, Any]:
     """Return arguments of a skill graph: what is recommended for an environment, but for what is given."""
     recommended = {**load_hyperparams(env_id), **check_hyperparams(arguments, "arguments")}
@@ -123,8 +113,7 @@ class SkillGraphLearner(Learner):
 
     def save(self, folder: Path) -> None:
         """Save the agent and its experience."""
-        self.agent.save(folder / "agent.zip")
-        self.agent.save_replay_buffer(folder / "experience")
+        save_agent(self.agent, folder)
 
     def load(self, folder: Path) -> None:
         """Load both."""

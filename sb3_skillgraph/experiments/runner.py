@@ -4,7 +4,6 @@ import csv
 import io
 import json
 import os
-import shutil
 import time
 import traceback
 from collections.abc import Sequence
@@ -23,9 +22,10 @@ from sb3_skillgraph.console import versions
 from sb3_skillgraph.evaluation import PairsResult, evaluate_pairs, run_pair
 from sb3_skillgraph.experiments.learners import ALGORITHMS, Learner
 from sb3_skillgraph.experiments.plan import RunSpec
+from sb3_skillgraph.run_folder import PROGRESS, STEPS, checkpoints, read_progress, take_checkpoint
 
-CONFIG, PROGRESS, DONE, ERROR, LOCK = "config.json", "progress.csv", "done.json", "error.txt", "lock"
-STEPS, SECONDS = "time/total_timesteps", "time/seconds"
+CONFIG, DONE, ERROR, LOCK = "config.json", "done.json", "error.txt", "lock"
+SECONDS = "time/seconds"
 STRETCH = 1_000  # environment steps between tests at test time: an episode
 Outcome = Literal["done", "skipped", "elsewhere", "failed"]
 
@@ -207,7 +207,7 @@ class _Run:
             document = json.dumps({"steps": n_steps, **snapshot})
             write_atomically(self.folder / f"graph_{n_steps}.json", document + "\n")
         if self.learner.resumable:
-            self._save(n_steps)
+            take_checkpoint(self.folder, n_steps, self.learner.save)
         self._clock = time.perf_counter()
 
     def _test(self, n_steps: int) -> PairsResult:
@@ -232,16 +232,6 @@ class _Run:
             test.close()
         return curves
 
-    def _save(self, n_steps: int) -> None:
-        before = checkpoints(self.folder)
-        partial = self.folder / "checkpoint.partial"
-        shutil.rmtree(partial, ignore_errors=True)
-        partial.mkdir()
-        self.learner.save(partial)
-        partial.rename(self.folder / f"checkpoint_{n_steps}")
-        for path in before.values():
-            shutil.rmtree(path)
-
 
 class Pinned(gym.Wrapper):
     """Begins every episode at one start, with one goal.
@@ -262,28 +252,6 @@ class Pinned(gym.Wrapper):
         :param options: not used
         """
         return self.env.reset(seed=seed, options=self.options)
-
-
-def checkpoints(folder: Path) -> dict[int, Path]:
-    """Find a run's checkpoints.
-
-    :param folder: of the run
-    :return: by the number of steps
-    """
-    found = (path for path in folder.glob("checkpoint_*") if path.is_dir())
-    return {int(path.name.partition("_")[2]): path for path in found}
-
-
-def read_progress(folder: Path) -> list[dict[str, Any]]:
-    """Read a run's rows.
-
-    :param folder: of the run
-    """
-    path = folder / PROGRESS
-    if not path.exists():
-        return []
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
 
 
 def write_atomically(path: Path, text: str) -> None:

@@ -1,0 +1,75 @@
+"""What a run keeps in its folder: checkpoints, from which it goes on exactly, and its log."""
+
+import csv
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch as th
+from stable_baselines3.common.type_aliases import GymEnv
+
+from sb3_skillgraph.agent import SkillGraphAgent
+
+PROGRESS, STEPS = "progress.csv", "time/total_timesteps"
+
+
+def checkpoints(folder: Path) -> dict[int, Path]:
+    """Find a run's checkpoints.
+
+    :param folder: of the run
+    :return: by the number of steps
+    """
+    found = (path for path in folder.glob("checkpoint_*") if path.is_dir())
+    return {int(path.name.partition("_")[2]): path for path in found}
+
+
+def take_checkpoint(folder: Path, n_steps: int, save: Callable[[Path], None]) -> None:
+    """Take a checkpoint, and let go of those before; whenever this is broken off, there is a whole one.
+
+    :param folder: of the run
+    :param n_steps: environment steps done
+    :param save: fills an empty folder
+    """
+    before = checkpoints(folder)
+    partial = folder / "checkpoint.partial"
+    shutil.rmtree(partial, ignore_errors=True)
+    partial.mkdir()
+    save(partial)
+    partial.rename(folder / f"checkpoint_{n_steps}")
+    for path in before.values():
+        shutil.rmtree(path)
+
+
+def save_agent(agent: SkillGraphAgent, folder: Path) -> None:
+    """Save an agent and its experience.
+
+    :param agent: the agent, between two calls of ``learn``
+    :param folder: of a checkpoint
+    """
+    agent.save(folder / "agent.zip")
+    agent.save_replay_buffer(folder / "experience")
+
+
+def load_agent(folder: Path, env: GymEnv, device: th.device | str = "auto") -> SkillGraphAgent:
+    """Load an agent and its experience.
+
+    :param folder: of a checkpoint
+    :param env: the environment it is to go on in
+    :param device: torch device
+    """
+    agent = SkillGraphAgent.load(folder / "agent.zip", env=env, device=device)
+    agent.load_replay_buffer(folder / "experience")
+    return agent
+
+
+def read_progress(folder: Path) -> list[dict[str, Any]]:
+    """Read a run's rows.
+
+    :param folder: of the run
+    """
+    path = folder / PROGRESS
+    if not path.exists():
+        return []
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))

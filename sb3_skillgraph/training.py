@@ -1,0 +1,123 @@
+"""One agent trained in a folder of its own, with checkpoints to go on from."""
+
+import json
+import shutil
+import sys
+from pathlib import Path
+from typing import Any
+
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.logger import HumanOutputFormat, Logger, configure
+
+from sb3_skillgraph.agent import SkillGraphAgent
+from sb3_skillgraph.callbacks import SkillGraphProgressBarCallback
+from sb3_skillgraph.console import UserError, for_people, versions
+from sb3_skillgraph.run_folder import STEPS, checkpoints, load_agent, read_progress, save_agent, take_checkpoint
+
+AGENT, CONFIG = "agent.zip", "config.json"
+CHECKPOINT_EVERY = 10_000  # environment steps
+
+
+def train(
+    env_id: str,
+    env_kwargs: dict[str, Any],
+    arguments: dict[str, Any],
+    steps: int,
+    seed: int,
+    out: Path,
+    n_envs: int = 1,
+    device: str = "auto",
+    verbose: bool = False,
+) -> SkillGraphAgent:
+    """Train an agent, from the last checkpoint in the folder if there is one; that comes to the same as in one go.
+
+    :param env_id: id of the environment
+    :param env_kwargs: its keyword arguments
+    :param arguments: of :class:`~sb3_skillgraph.SkillGraphAgent`
+    :param steps: environment steps in all
+    :param seed: of everything random
+    :param out: receives ``agent.zip`` (when interrupted, too), ``progress.csv``, ``config.json`` and, until the end, the
+        newest checkpoint
+    :param n_envs: copies of the environment
+    :param device: torch device
+    :param verbose: whether to print SB3's table as well as the progress bar
+    :return: the agent
+    :raises UserError: if an argument is refused, or the folder holds a run with other ones
+    """
+    config = dict(env=env_id, env_kwargs=env_kwargs, steps=steps, seed=seed, n_envs=n_envs, arguments=arguments)
+    saved = checkpoints(out)
+    if saved:
+        _check_config(out, config)
+    with for_people():
+        env = make_vec_env(env_id, n_envs=n_envs, env_kwargs=env_kwargs)
+    try:
+        with for_people():
+            if saved:
+                agent = load_agent(saved[max(saved)], env, device)
+                print(f"going on after {agent.num_timesteps} steps")
+            else:
+                agent = SkillGraphAgent(env=env, seed=seed, **{"device": device, **arguments})
+        out.mkdir(parents=True, exist_ok=True)
+        write_json(out / CONFIG, {**config, "versions": versions()})
+        agent.set_logger(_logger(out, agent.num_timesteps, verbose))
+        _learn(agent, steps, out)
+        return agent
+    finally:
+        env.close()
+
+
+def _learn(agent: SkillGraphAgent, steps: int, out: Path) -> None:
+    begin, every = agent.num_timesteps, CHECKPOINT_EVERY
+    bar = SkillGraphProgressBarCallback(steps)
+    try:
+        for target in [*range(begin + every - begin % every, steps, every), steps]:
+            agent.learn(target - agent.num_timesteps, callback=bar, reset_num_timesteps=False)
+            if target < steps:
+                take_checkpoint(out, agent.num_timesteps, lambda folder: save_agent(agent, folder))
+    finally:
+        bar.close()
+        agent.logger.close()
+        agent.save(out / AGENT)
+        print(f"{agent.num_timesteps} steps; the agent is in {out / AGENT}, its log in {out / 'progress.csv'}")
+        if agent.num_timesteps < steps and checkpoints(out):
+            print(f"the same command goes on after {max(checkpoints(out))} steps")
+    for path in checkpoints(out).values():
+        shutil.rmtree(path)
+
+
+def _logger(out: Path, n_steps: int, verbose: bool) -> Logger:
+    """Return a logger whose file begins with the rows of the steps that are done."""
+    rows = [row for row in read_progress(out) if int(row[STEPS]) <= n_steps]
+    logger = configure(str(out), ["csv"])
+    for row in rows:
+        for name, value in row.items():
+            if value:
+                logger.record(name, float(value) if set(value) - set("-0123456789") else int(value))
+        logger.dump(int(row[STEPS]))
+    if verbose:
+        logger.output_formats.append(HumanOutputFormat(sys.stdout))
+    return logger
+
+
+def _check_config(out: Path, config: dict[str, Any]) -> None:
+    before = json.loads((out / CONFIG).read_text())
+    del before["versions"]
+    if before != json.loads(_as_json(config)):
+        raise UserError(
+            f"{out} holds an unfinished run with other settings, see its {CONFIG}: give the same ones to go on with it, "
+            "or another folder with --out."
+        )
+
+
+def write_json(path: Path, document: dict[str, Any]) -> None:
+    """Write a document into a folder that need not be there yet.
+
+    :param path: the file
+    :param document: plain data; classes, such as ``option_class``, are written by their names
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(_as_json(document) + "\n")
+
+
+def _as_json(document: dict[str, Any]) -> str:
+    return json.dumps(document, indent=2, default=lambda item: getattr(item, "__name__", str(item)))
