@@ -26,8 +26,7 @@ from sb3_skillgraph import SkillGraphAgent, __version__
 from sb3_skillgraph.baselines import RandomWalk
 from sb3_skillgraph.envs import MazeGeometry
 from sb3_skillgraph.evaluation import sample_pairs
-from sb3_skillgraph.experiments.runner import CONFIG
-from sb3_skillgraph.run_folder import checkpoints, load_agent
+from sb3_skillgraph.run_folder import CONFIG, checkpoints, load_agent
 
 TOLERANCES = {"0.45 m": 0.45, "0.6 m": 0.6, "0.6 cells": 2.4}
 WALKS = ("pairs", "far", "straight")

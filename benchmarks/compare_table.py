@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from scipy.stats import ttest_ind
 
-from sb3_skillgraph.experiments.plan import RunSpec, load_plan
-from sb3_skillgraph.experiments.runner import status
+from sb3_skillgraph.experiments.plan import load_plan
+from sb3_skillgraph.experiments.runner import RunStatus, status
 from sb3_skillgraph.experiments.summary import estimate
 
 # What Figure 5 of the paper shows, and what it leaves open: is it the planning, or hindsight, or events?
@@ -31,10 +31,9 @@ ORDER = [
 ]
 
 
-def summarise(specs: list[RunSpec], out: pathlib.Path) -> list[dict[str, Any]]:
+def summarise(done: list[RunStatus]) -> list[dict[str, Any]]:
     """Return a row for every method on every environment that has a finished run, the best first."""
     rows = []
-    done = [run for run in status(specs, out) if run.state == "done"]
     for environment, method in dict.fromkeys((run.spec.environment, run.spec.method) for run in done):
         here = [run for run in done if (run.spec.environment, run.spec.method) == (environment, method)]
         scores = np.array([run.success_rate for run in here])
@@ -57,11 +56,11 @@ def summarise(specs: list[RunSpec], out: pathlib.Path) -> list[dict[str, Any]]:
     return sorted(rows, key=lambda row: (order.index(row["environment"]), -row["mean"]))
 
 
-def compare(specs: list[RunSpec], out: pathlib.Path) -> list[dict[str, Any]]:
+def compare(done: list[RunStatus]) -> list[dict[str, Any]]:
     """Return a row for every pair of methods whose order is asked for: the difference of means with Welch's 95 % interval."""
     scores: dict[tuple[str, str], list[float]] = {}
-    for run in status(specs, out):
-        if run.state == "done" and run.success_rate is not None:
+    for run in done:
+        if run.success_rate is not None:
             scores.setdefault((run.spec.environment, run.spec.method), []).append(run.success_rate)
     rows = []
     for environment in dict.fromkeys(environment for environment, _ in scores):
@@ -120,10 +119,10 @@ def main() -> None:
     parser.add_argument("plan", type=pathlib.Path)
     parser.add_argument("out", type=pathlib.Path, help="folder of all runs")
     args = parser.parse_args()
-    specs = load_plan(args.plan)
-    rows, compared = summarise(specs, args.out), compare(specs, args.out)
-    if not rows:
+    done = [run for run in status(load_plan(args.plan), args.out) if run.state == "done"]
+    if not done:
         raise SystemExit(f"no run of {args.plan} is finished in {args.out}")
+    rows, compared = summarise(done), compare(done)
     write(args.out / f"{args.plan.stem}_summary.csv", rows)
     print(table(["Task", "Steps", "Method", "Mean", "IQM (95 %)", "Seeds' range", "Seeds"], [*map(line, rows)]))
     if compared:

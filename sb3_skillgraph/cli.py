@@ -21,8 +21,8 @@ from sb3_skillgraph.evaluation import PairsResult, evaluate_pairs
 from sb3_skillgraph.experiments.commands import add_compare, add_figure, add_status
 from sb3_skillgraph.hyperparams import check_hyperparams, did_you_mean, load_hyperparams
 from sb3_skillgraph.plotting import plot_plan, plot_skill_graph, run_plan, save_figure
-from sb3_skillgraph.run_folder import checkpoints
-from sb3_skillgraph.training import AGENT, train, write_json
+from sb3_skillgraph.run_folder import AGENT, checkpoints
+from sb3_skillgraph.training import train, write_json
 
 DEMO_ENV, DEMO_STEPS, DEMO_PAIRS = "SkillGraph/PointMazeMedium-v0", 100_000, 100
 USER_ERROR, INTERRUPTED = 2, 130

@@ -11,7 +11,8 @@ from stable_baselines3.common.type_aliases import GymEnv
 
 from sb3_skillgraph.agent import SkillGraphAgent
 
-PROGRESS, STEPS = "progress.csv", "time/total_timesteps"
+AGENT, CONFIG, PROGRESS = "agent.zip", "config.json", "progress.csv"
+STEPS = "time/total_timesteps"
 
 
 def checkpoints(folder: Path) -> dict[int, Path]:
@@ -22,6 +23,16 @@ def checkpoints(folder: Path) -> dict[int, Path]:
     """
     found = (path for path in folder.glob("checkpoint_*") if path.is_dir())
     return {int(path.name.partition("_")[2]): path for path in found}
+
+
+def stops(begin: int, end: int, every: int) -> list[int]:
+    """Return the numbers of steps at which a run stops for a checkpoint or a test, its end the last of them.
+
+    :param begin: steps done already
+    :param end: steps in all
+    :param every: steps between stops
+    """
+    return [*range(begin + every - begin % every, end, every), end]
 
 
 def take_checkpoint(folder: Path, n_steps: int, save: Callable[[Path], None]) -> None:
@@ -47,7 +58,7 @@ def save_agent(agent: SkillGraphAgent, folder: Path) -> None:
     :param agent: the agent, between two calls of ``learn``
     :param folder: of a checkpoint
     """
-    agent.save(folder / "agent.zip")
+    agent.save(folder / AGENT)
     agent.save_replay_buffer(folder / "experience")
 
 
@@ -58,7 +69,7 @@ def load_agent(folder: Path, env: GymEnv, device: th.device | str = "auto") -> S
     :param env: the environment it is to go on in
     :param device: torch device
     """
-    agent = SkillGraphAgent.load(folder / "agent.zip", env=env, device=device)
+    agent = SkillGraphAgent.load(folder / AGENT, env=env, device=device)
     agent.load_replay_buffer(folder / "experience")
     return agent
 

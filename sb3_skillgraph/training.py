@@ -12,9 +12,19 @@ from stable_baselines3.common.logger import HumanOutputFormat, Logger, configure
 from sb3_skillgraph.agent import SkillGraphAgent
 from sb3_skillgraph.callbacks import SkillGraphProgressBarCallback
 from sb3_skillgraph.console import UserError, for_people, versions
-from sb3_skillgraph.run_folder import STEPS, checkpoints, load_agent, read_progress, save_agent, take_checkpoint
+from sb3_skillgraph.run_folder import (
+    AGENT,
+    CONFIG,
+    PROGRESS,
+    STEPS,
+    checkpoints,
+    load_agent,
+    read_progress,
+    save_agent,
+    stops,
+    take_checkpoint,
+)
 
-AGENT, CONFIG = "agent.zip", "config.json"
 CHECKPOINT_EVERY = 10_000  # environment steps
 
 
@@ -67,10 +77,9 @@ def train(
 
 
 def _learn(agent: SkillGraphAgent, steps: int, out: Path) -> None:
-    begin, every = agent.num_timesteps, CHECKPOINT_EVERY
     bar = SkillGraphProgressBarCallback(steps)
     try:
-        for target in [*range(begin + every - begin % every, steps, every), steps]:
+        for target in stops(agent.num_timesteps, steps, CHECKPOINT_EVERY):
             agent.learn(target - agent.num_timesteps, callback=bar, reset_num_timesteps=False)
             if target < steps:
                 take_checkpoint(out, agent.num_timesteps, lambda folder: save_agent(agent, folder))
@@ -78,7 +87,7 @@ def _learn(agent: SkillGraphAgent, steps: int, out: Path) -> None:
         bar.close()
         agent.logger.close()
         agent.save(out / AGENT)
-        print(f"{agent.num_timesteps} steps; the agent is in {out / AGENT}, its log in {out / 'progress.csv'}")
+        print(f"{agent.num_timesteps} steps; the agent is in {out / AGENT}, its log in {out / PROGRESS}")
         if agent.num_timesteps < steps and checkpoints(out):
             print(f"the same command goes on after {max(checkpoints(out))} steps")
     for path in checkpoints(out).values():

@@ -19,7 +19,7 @@ from sb3_skillgraph.evaluation import Predictor
 from sb3_skillgraph.hyperparams import check_hyperparams, load_hyperparams
 from sb3_skillgraph.options.learner import OptionDDPG, OptionTD3
 from sb3_skillgraph.plotting import event_links, near_links
-from sb3_skillgraph.run_folder import load_agent, save_agent
+from sb3_skillgraph.run_folder import load_agent, save_agent, stops
 
 Check = Callable[[int], None]
 _COVERING_CLASSES = {"OptionDDPG": OptionDDPG, "OptionTD3": OptionTD3}
@@ -106,7 +106,7 @@ class SkillGraphLearner(Learner):
 
     def learn(self, begin: int, end: int, every: int, check: Check) -> None:
         """Learn from check to check: between two calls of ``learn`` an agent can be saved exactly."""
-        for target in [*range(begin + every - begin % every, end, every), end]:
+        for target in stops(begin, end, every):
             self.agent.learn(target - begin, log_interval=None, reset_num_timesteps=False)
             begin = target
             check(target)

@@ -22,9 +22,9 @@ from sb3_skillgraph.console import versions
 from sb3_skillgraph.evaluation import PairsResult, evaluate_pairs, run_pair
 from sb3_skillgraph.experiments.learners import ALGORITHMS, Learner
 from sb3_skillgraph.experiments.plan import RunSpec
-from sb3_skillgraph.run_folder import PROGRESS, STEPS, checkpoints, read_progress, take_checkpoint
+from sb3_skillgraph.run_folder import CONFIG, PROGRESS, STEPS, checkpoints, read_progress, take_checkpoint
 
-CONFIG, DONE, ERROR, LOCK = "config.json", "done.json", "error.txt", "lock"
+DONE, ERROR, LOCK = "done.json", "error.txt", "lock"
 SECONDS = "time/seconds"
 STRETCH = 1_000  # environment steps between tests at test time: an episode
 Outcome = Literal["done", "skipped", "elsewhere", "failed"]
