@@ -31,18 +31,25 @@ ORDER = [
 ]
 
 
-def summarise(done: list[RunStatus]) -> list[dict[str, Any]]:
+def grouped(done: list[RunStatus]) -> dict[tuple[str, str], list[RunStatus]]:
+    """Return the runs of every environment and method."""
+    groups: dict[tuple[str, str], list[RunStatus]] = {}
+    for run in done:
+        groups.setdefault((run.spec.environment, run.spec.method), []).append(run)
+    return groups
+
+
+def summarise(groups: dict[tuple[str, str], list[RunStatus]]) -> list[dict[str, Any]]:
     """Return a row for every method on every environment that has a finished run, the best first."""
     rows = []
-    for environment, method in dict.fromkeys((run.spec.environment, run.spec.method) for run in done):
-        here = [run for run in done if (run.spec.environment, run.spec.method) == (environment, method)]
-        scores = np.array([run.success_rate for run in here])
+    for (environment, method), runs in groups.items():
+        scores = np.array([run.success_rate for run in runs])
         iqm, low, high = estimate(scores[None])
         rows.append(
             {
                 "environment": environment,
                 "method": method,
-                "steps": here[0].spec.steps,
+                "steps": runs[0].spec.steps,
                 "seeds": len(scores),
                 "mean": scores.mean(),
                 "iqm": iqm,
@@ -56,16 +63,13 @@ def summarise(done: list[RunStatus]) -> list[dict[str, Any]]:
     return sorted(rows, key=lambda row: (order.index(row["environment"]), -row["mean"]))
 
 
-def compare(done: list[RunStatus]) -> list[dict[str, Any]]:
+def compare(groups: dict[tuple[str, str], list[RunStatus]]) -> list[dict[str, Any]]:
     """Return a row for every pair of methods whose order is asked for: the difference of means with Welch's 95 % interval."""
-    scores: dict[tuple[str, str], list[float]] = {}
-    for run in done:
-        if run.success_rate is not None:
-            scores.setdefault((run.spec.environment, run.spec.method), []).append(run.success_rate)
+    scores = {key: np.array([run.success_rate for run in runs]) for key, runs in groups.items()}
     rows = []
     for environment in dict.fromkeys(environment for environment, _ in scores):
         for better, worse in ORDER:
-            a, b = scores.get((environment, better), []), scores.get((environment, worse), [])
+            a, b = (scores.get((environment, method), np.empty(0)) for method in (better, worse))
             if min(len(a), len(b)) < 2:
                 continue
             difference = low = high = float(np.mean(a) - np.mean(b))
@@ -122,7 +126,8 @@ def main() -> None:
     done = [run for run in status(load_plan(args.plan), args.out) if run.state == "done"]
     if not done:
         raise SystemExit(f"no run of {args.plan} is finished in {args.out}")
-    rows, compared = summarise(done), compare(done)
+    groups = grouped(done)
+    rows, compared = summarise(groups), compare(groups)
     write(args.out / f"{args.plan.stem}_summary.csv", rows)
     print(table(["Task", "Steps", "Method", "Mean", "IQM (95 %)", "Seeds' range", "Seeds"], [*map(line, rows)]))
     if compared:
