@@ -71,25 +71,27 @@ def test_explorations_go_past_a_random_point(explore_beyond: float) -> None:
 
 def test_finds_a_way_to_a_region_that_training_never_reached() -> None:
     """A door opens after training: adaptation looks for a way to the goal behind it, and old goals stay reachable."""
-    shut: MazeMap = [[1] * 7, [1, "r", 0, 1, 0, 0, 1], [1, 0, 0, 1, 0, 0, 1], [1] * 7]
-    opened: MazeMap = [[1] * 7, [1, "r", 0, 1, 0, 0, 1], [1, 0, 0, 0, 0, 0, 1], [1] * 7]
-    agent = SkillGraphAgent(
-        "MultiInputPolicy", gym.make(TOY, maze_map=shut), **{**SMALL, "policy_kwargs": dict(net_arch=[32, 32]), "seed": 1}
-    )
+    shut: MazeMap = [[1] * 6, [1, "r", 0, 1, 0, 1], [1, 0, 0, 1, 0, 1], [1, 0, 0, 1, 0, 1], [1] * 6]
+    opened: MazeMap = [*shut[:3], [1, 0, 0, 0, 0, 1], shut[4]]  # who walks straight on stands at the wall beside the door
+    arguments = {**SMALL, "policy_kwargs": dict(net_arch=[32, 32]), "event_reach": 15, "seed": 1}
+    agent = SkillGraphAgent("MultiInputPolicy", gym.make(TOY, maze_map=shut), **arguments)
     agent.learn(3000, log_interval=None)
-    assert agent.visited.points[:, 0].max() < 0.0
+    assert agent.visited.points[:, 0].max() < 0.5
     env = gym.make(TOY, maze_map=opened, terminate_on_success=True)
-    old, new = np.array([-1.5, -0.5]), np.array([2.0, 0.5])
-    assert not reached(agent, env, new)
+    old, new = np.array([-0.5, -1.0]), np.array([1.5, 1.0])
+    before = success_rate(agent, env, new)
+    assert before < 0.5
     agent.set_env(new_vec_env(TOY, 1, maze_map=opened))  # seeded
     agent.adapt(new, total_timesteps=4000)
-    assert reached(agent, env, new)
-    assert reached(agent, env, old)
+    assert success_rate(agent, env, new) > before + 0.4  # so it was with each of 20 seeds
+    assert success_rate(agent, env, old) == 1.0
 
 
-def reached(agent: SkillGraphAgent, env: gym.Env, goal: np.ndarray) -> bool:
+def success_rate(agent: SkillGraphAgent, env: gym.Env, goal: np.ndarray) -> float:
+    """From every cell of the left room of the maze with the door."""
     env.reset(seed=0)
-    return run_pair(agent, env, np.array([-2.0, 0.5]), goal, np.nan).success
+    starts = [np.array([x, y]) for x in (-1.5, -0.5) for y in (-1.0, 0.0, 1.0)]
+    return float(np.mean([run_pair(agent, env, start, goal, np.nan).success for start in starts]))
 
 
 @pytest.mark.parametrize(
