@@ -8,10 +8,11 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_skillgraph.chaining import DeepSkillChaining
 from sb3_skillgraph.controller import Controller, ControllerState
-from sb3_skillgraph.curriculum import Curriculum, Strategy
+from sb3_skillgraph.curriculum import Curriculum
 from sb3_skillgraph.events import SalientEvent
 from sb3_skillgraph.goal_env import GoalSpec, Oracle, env_attribute, find_view
 from sb3_skillgraph.graph import SkillGraph
+from sb3_skillgraph.missions import Strategy
 from sb3_skillgraph.options.factory import OptionFactory, copy_policy
 from sb3_skillgraph.options.learner import OptionLearner
 from sb3_skillgraph.options.option import Option

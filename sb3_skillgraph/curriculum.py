@@ -1,15 +1,16 @@
 """What the agent does while it learns: which target to pursue, and what each run teaches (sections 3.2.1-3.2.7)."""
 
 import math
-from dataclasses import asdict, dataclass
-from typing import Any, Literal, NamedTuple
+from dataclasses import asdict
+from typing import Any
 
 import numpy as np
 
 from sb3_skillgraph.chaining import DeepSkillChaining, SkillChain
-from sb3_skillgraph.controller import GLOBAL, OptionOutcome, Request
+from sb3_skillgraph.controller import GLOBAL, OptionOutcome
 from sb3_skillgraph.events import SalientEvent
 from sb3_skillgraph.graph import SkillGraph
+from sb3_skillgraph.missions import Mission, Strategy
 from sb3_skillgraph.planner import GraphPlanner
 from sb3_skillgraph.salience.discovery import EventDiscovery
 from sb3_skillgraph.visited import VisitedStates
@@ -17,56 +18,6 @@ from sb3_skillgraph.visited import VisitedStates
 N_EXPLORED = 10  # candidates for an exploration
 LOOK_FOR_A_WAY = 0.75  # share of explorations among the missions to a goal that nothing ever came near
 JOINED_ALREADY = 3.0  # option runs the agent goes further to practise a chain that joins a new event
-
-
-class Strategy(NamedTuple):
-    """How targets are chosen; the fields are arguments of :class:`~sb3_skillgraph.SkillGraphAgent`, described there."""
-
-    target_choice: Literal["nearest", "uniform"]
-    practise_prob: float
-    practise: Literal["least_tried", "random"]
-    explore_prob: float
-    exploration_steps: int
-    explore_beyond: float
-    max_tries: int
-    link_reach: int
-    off_policy_runs: bool
-
-
-@dataclass
-class Mission:
-    """What one environment's agent is about: to reach an event or a point, and perhaps to explore from there.
-
-    :param goal: where to go, shape ``(goal_dim,)``
-    :param event: id of the target event; None for any other point
-    :param chain: id of the chain to practise
-    :param left_graph: whether the chain's source has been reached
-    :param explore_steps: environment steps to explore on arrival
-    :param beyond: the point to explore towards; None for a random walk
-    :param exploring: whether exploration has begun
-    :param n_failures: options that timed out during the mission
-    """
-
-    goal: np.ndarray
-    event: str | None = None
-    chain: str | None = None
-    left_graph: bool = False
-    explore_steps: int = 0
-    beyond: np.ndarray | None = None
-    exploring: bool = False
-    n_failures: int = 0
-
-    @property
-    def request(self) -> Request:
-        """The mission as the controller sees it."""
-        if self.exploring:
-            return Request(self.goal if self.beyond is None else self.beyond, direct=True)
-        return Request(self.goal, self.event, self.chain, self.left_graph)
-
-    @property
-    def random_walk(self) -> bool:
-        """Whether actions are to be random now."""
-        return self.exploring and self.beyond is None
 
 
 class Curriculum:

@@ -32,8 +32,10 @@ FLOORS: dict[str, float] = {
     "planner": 3,
     "controller": 4,
     "smdp": 4,
+    "missions": 4.1,
     "curriculum": 4.2,  # turns the controller's outcomes into knowledge
-    "persistence": 4.5,  # these three are the agent's lower storeys
+    "parameters": 4.4,  # these four are the agent's lower storeys
+    "persistence": 4.5,
     "assembly": 4.7,
     "rollouts": 4.8,
     "agent": 5,
