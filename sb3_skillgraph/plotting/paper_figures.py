@@ -1,7 +1,7 @@
 """The paper's figures from arrays: growth, exploration, learning curves, and how sets become edges."""
 
 from collections.abc import Collection, Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib import colormaps
@@ -121,15 +121,14 @@ def plot_curves(
 
     :param axes: where to draw
     :param curves: by method
-    :param methods: all there are, on other panels, too: each has its colour
+    :param methods: all there are, on other panels, too: each has its colour and dashes
     :param title: of the panel
     :param x_label: what the steps are
     """
-    colours = _colours(methods)
+    styles = _styles(methods)
     for name, curve in curves.items():
-        colour = colours[name]
-        axes.plot(curve.steps, curve.mean, label=name, color=colour, marker="o", markersize=3)
-        axes.fill_between(curve.steps, curve.low, curve.high, color=colour, alpha=0.15, linewidth=0)
+        axes.plot(curve.steps, curve.mean, label=name, **styles[name])
+        axes.fill_between(curve.steps, curve.low, curve.high, color=styles[name]["color"], alpha=0.15, linewidth=0)
     axes.set(title=title, xlabel=x_label, ylabel="success rate (interquartile mean)", ylim=(-0.02, 1.02))
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     axes.grid(alpha=0.3)
@@ -142,14 +141,18 @@ def add_legend(axes: Axes, methods: Sequence[str], shown: Collection[str]) -> No
     :param methods: all there are
     :param shown: those that some panel has a curve of
     """
-    colours = {name: colour for name, colour in _colours(methods).items() if name in shown}
-    handles = [Line2D([], [], color=colour, marker="o", markersize=3, label=name) for name, colour in colours.items()]
+    handles = [Line2D([], [], label=name, **style) for name, style in _styles(methods).items() if name in shown]
     axes.legend(handles=handles, fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
 
 
-def _colours(methods: Sequence[str]) -> dict[str, tuple[float, float, float, float]]:
+def _styles(methods: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """Later lines lie on top of earlier ones, which show through their gaps where they coincide."""
     colours = colormaps["tab10" if len(methods) <= 10 else "tab20"]
-    return {name: colours(i % colours.N) for i, name in enumerate(methods)}
+    dashes = ["-", (0, (6, 3)), (0, (3, 5)), (0, (1, 5))]
+    return {
+        name: dict(color=colours(i % colours.N), linestyle=dashes[i % len(dashes)], linewidth=2, marker="o", markersize=3)
+        for i, name in enumerate(methods)
+    }
 
 
 def plot_growth(axes: Axes, snapshot: GraphSnapshot, geometry: MazeGeometry | None, name: str) -> None:
