@@ -10,6 +10,8 @@ from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import Any
 
+import dask
+import distributed
 import numpy as np
 import pytest
 import yaml
@@ -136,15 +138,18 @@ def test_an_error_is_kept_and_the_run_tried_again(tmp_path: Path) -> None:
     assert run(broken, tmp_path) == "failed"
     assert "Error" in (broken.folder(tmp_path) / "error.txt").read_text()
     assert status([broken], tmp_path)[0].state == "failed"
-    assert run(spec(), tmp_path) == "failed"
-    assert "another configuration" in (broken.folder(tmp_path) / "error.txt").read_text()
+    mended = spec()  # nothing had been done with the other settings
+    assert run(mended, tmp_path) == "done"
+    assert not (mended.folder(tmp_path) / "error.txt").exists()
 
 
 def test_what_is_done_is_not_taken_for_something_else(tmp_path: Path) -> None:
     assert run(spec("random_walk"), tmp_path) == "done"
     other = spec("random_walk", final_pairs=9)
-    assert run(other, tmp_path) == "failed"
-    assert "another configuration" in (other.folder(tmp_path) / "error.txt").read_text()
+    assert run(other, tmp_path) == "refused"
+    assert not (other.folder(tmp_path) / "error.txt").exists()
+    assert status([other], tmp_path)[0].state == "other"
+    assert method_curves([other], tmp_path) == {}
     assert status([spec("random_walk")], tmp_path)[0].state == "done"
 
 
@@ -216,6 +221,15 @@ def test_on_ray(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_on_dask(tmp_path: Path) -> None:
     specs = load_plan(plan(tmp_path / "plan.yml", methods={"walk": {"algorithm": "random_walk"}}))
     assert compare(specs, tmp_path / "runs", n_jobs=2, backend="dask") == ["done"] * 2
+
+
+def test_on_a_dask_cluster_that_is_there_already(tmp_path: Path) -> None:
+    specs = load_plan(plan(tmp_path / "plan.yml", methods={"walk": {"algorithm": "random_walk"}}))
+    with (
+        distributed.LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None) as cluster,
+        dask.config.set({"scheduler-address": cluster.scheduler_address}),
+    ):
+        assert compare(specs, tmp_path / "runs", n_jobs=2, backend="dask") == ["done"] * 2
 
 
 WORKER = """
@@ -294,6 +308,18 @@ def test_killed_at_any_moment_it_comes_to_the_same_and_two_workers_share(tmp_pat
         ({"environments": {"toy": {"id": TOY}}}, "environment 'toy': steps is missing"),
         ({"environments": {"toy": {"id": TOY, "steps": 5, "methods": ["dgs"]}}}, "unknown method 'dgs'"),
         ({"environments": ["toy"]}, "environments must be a mapping"),
+        (
+            {"methods": {"flat": {"algorithm": "uvfa", "arguments": {"goal_frq": 1}}}},
+            "unknown argument 'goal_frq'.*'goal_freq'",
+        ),
+        ({"methods": {"dco": {"algorithm": "covering_options", "arguments": {"options": 1}}}}, "unknown argument 'options'"),
+        ({"methods": {"walk": {"algorithm": "random_walk", "arguments": {"steps": 1}}}}, "unknown argument 'steps'"),
+        ({"methods": {False: {"algorithm": "random_walk"}}}, "False is no name"),
+        ({"methods": {"../walk": {"algorithm": "random_walk"}}}, "'../walk' is no name"),
+        ({"environments": {"toy": {"id": "SkillGraph/TyoMaze-v0", "steps": 5}}}, "environment 'toy': .*TyoMaze"),
+        ({"environments": {"toy": {"id": TOY, "steps": 5, "methods": [3]}}}, "unknown method 3"),
+        ({"seeds": [0, 0]}, "a seed stands twice"),
+        ({"seeds": ["a"]}, "a seed must be a whole number, 0 or more, not 'a'"),
     ],
 )
 def test_what_a_plan_must_not_say(changes: dict[str, Any], message: str, tmp_path: Path) -> None:

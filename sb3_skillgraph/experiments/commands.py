@@ -102,7 +102,9 @@ def _compare(args: argparse.Namespace) -> int:
     for spec, outcome in zip(specs, outcomes, strict=True):
         if outcome == "failed":
             print(f"failed: see {spec.folder(args.out) / ERROR}")
-    return 1 if counts["failed"] else 0
+        if outcome == "refused":
+            print(f"refused: {spec.folder(args.out)} holds a run with other settings: remove it, or choose another folder")
+    return 1 if counts["failed"] or counts["refused"] else 0
 
 
 def _status(args: argparse.Namespace) -> int:
@@ -114,7 +116,7 @@ def _print_status(runs: list[RunStatus]) -> None:
     table = Table()
     for column in ("environment", "method"):
         table.add_column(column, no_wrap=True)
-    for column in ("done", "running", "failed", "success (IQM, 95 %)", "time left"):
+    for column in ("done", "running", "failed", "steps", "success (IQM, 95 %)", "time left, one by one"):
         table.add_column(column, justify="right")
     for environment, method in dict.fromkeys((run.spec.environment, run.spec.method) for run in runs):
         here = [run for run in runs if (run.spec.environment, run.spec.method) == (environment, method)]
@@ -125,11 +127,15 @@ def _print_status(runs: list[RunStatus]) -> None:
             mean, low, high = estimate(np.array([scores]))
             success = f"{mean:.2f} ({low:.2f} to {high:.2f})"
         known = [run.seconds_left for run in here if run.seconds_left is not None and run.state != "done"]
-        waiting = sum(run.seconds_left is None for run in here)
+        waiting = sum(run.seconds_left is None and run.state != "other" for run in here)
         left = [f"{sum(known) / 60:.0f} min"] * bool(known) + [f"{waiting} to begin"] * bool(waiting)
         counts = (f"{states['done']}/{len(here)}", str(states["running"]), str(states["failed"]))
-        table.add_row(environment, method, *counts, success, " and ".join(left) or "-")
+        steps = f"{sum(run.steps for run in here):,} of {sum(run.spec.steps for run in here):,}"
+        table.add_row(environment, method, *counts, steps, success, " and ".join(left) or "-")
     Console().print(table)
+    others = sum(run.state == "other" for run in runs)
+    if others:
+        print(f"{others} in the place of which there is a run with other settings; they are left out")
 
 
 def _figure(args: argparse.Namespace) -> int:

@@ -13,7 +13,7 @@ from sb3_skillgraph.agent import SkillGraphAgent
 from sb3_skillgraph.baselines import RandomWalk
 from sb3_skillgraph.envs import MazeGeometry
 from sb3_skillgraph.experiments.plan import RunSpec
-from sb3_skillgraph.experiments.runner import DONE, STRETCH
+from sb3_skillgraph.experiments.runner import DONE, STRETCH, is_done
 from sb3_skillgraph.experiments.summary import estimate
 from sb3_skillgraph.plotting import paper_figures as draw
 from sb3_skillgraph.run_folder import STEPS, checkpoints, load_agent, read_progress
@@ -60,7 +60,7 @@ def _finished(specs: Sequence[RunSpec], out: Path, salience: str | None = None, 
         for spec in specs
         if spec.algorithm == "skill_graph"
         and (salience is None or spec.arguments.get("salience", "frontier") == salience)
-        and (spec.folder(out) / DONE).exists()
+        and is_done(spec, out)
     ]
     kind = "of a skill graph" if salience is None else f"of a skill graph with salience={salience}"
     if not found:
@@ -153,7 +153,7 @@ def curves(specs: Sequence[RunSpec], out: Path) -> Axes:
     methods = list(dict.fromkeys(spec.method for spec in specs))
     panels = draw.new_panels(len(labels) * (1 + any(testing)), n_rows=1 + any(testing))
     for axes, by_method, here, label in zip(panels, training, by_label, labels, strict=False):
-        seeds = Counter(spec.method for spec in here if (spec.folder(out) / DONE).exists()).values()
+        seeds = Counter(spec.method for spec in here if is_done(spec, out)).values()
         fewest, most = min(seeds, default=0), max(seeds, default=0)
         n_seeds = f"{most}" if fewest == most else f"{fewest} to {most}"
         draw.plot_curves(axes, by_method, methods, f"{label} ({n_seeds} seed{'s' * (most > 1)})")
@@ -175,7 +175,7 @@ def method_curves(specs: Sequence[RunSpec], out: Path) -> dict[str, draw.Curve]:
     """
     result = {}
     for method in dict.fromkeys(spec.method for spec in specs):
-        done = [spec for spec in specs if spec.method == method and (spec.folder(out) / DONE).exists()]
+        done = [spec for spec in specs if spec.method == method and is_done(spec, out)]
         if not done:
             continue
         steps = [int(row[STEPS]) for row in read_progress(done[0].folder(out))]
@@ -201,8 +201,8 @@ def practice_curves(specs: Sequence[RunSpec], out: Path) -> dict[str, draw.Curve
     """
     result = {}
     for method in dict.fromkeys(spec.method for spec in specs):
-        files = [spec.folder(out) / DONE for spec in specs if spec.method == method]
-        tests = [json.loads(file.read_text())["test_time"] for file in files if file.exists()]
+        files = [spec.folder(out) / DONE for spec in specs if spec.method == method and is_done(spec, out)]
+        tests = [json.loads(file.read_text())["test_time"] for file in files]
         if not tests or not tests[0]:
             continue
         scores = np.array([np.mean(pairs, axis=0) for pairs in tests])
@@ -253,6 +253,8 @@ def _edge(specs: Sequence[RunSpec], out: Path, to_event: bool) -> Axes:
 def clearest_edge(agent: SkillGraphAgent, to_event: bool) -> draw.EdgeExample | None:
     """Find the edge between two options that is easiest to see: a sure one between sets that overlap little.
 
+    All effects of the first option lie where the second can start; the graph asks for the most of them only.
+
     :param agent: the agent
     :param to_event: whether the first option is to lead to an event rather than to another option
     :return: None if there is no such edge
@@ -264,6 +266,8 @@ def clearest_edge(agent: SkillGraphAgent, to_event: bool) -> draw.EdgeExample | 
             continue
         first, second = graph.options[source], graph.options[target]
         if (first.target in graph.events) != to_event or len(first.effects) < 3:
+            continue
+        if not second.initiation.optimistic(np.stack(first.effects)).all():
             continue
         starts, mine = (points[option.initiation.optimistic(points)] for option in (second, first))
         overlap = float(second.initiation.optimistic(mine).mean()) if len(mine) else 1.0

@@ -4,19 +4,20 @@ import io
 import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
+from inspect import signature
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
-from stable_baselines3 import TD3
+from stable_baselines3 import DDPG, TD3
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_skillgraph.agent import SkillGraphAgent
 from sb3_skillgraph.baselines import CoveringOptions, HindsightRecipe, OptionTask, RandomWalk, make_her, make_uvfa
 from sb3_skillgraph.evaluation import Predictor
-from sb3_skillgraph.hyperparams import check_hyperparams, load_hyperparams
+from sb3_skillgraph.hyperparams import check_hyperparams, did_you_mean, load_hyperparams
 from sb3_skillgraph.options.learner import OptionDDPG, OptionTD3
 from sb3_skillgraph.plotting import event_links, near_links
 from sb3_skillgraph.run_folder import load_agent, save_agent, stops
@@ -40,6 +41,16 @@ class Learner(ABC):
 
     @abstractmethod
     def __init__(self, env_id: str, env_kwargs: dict[str, Any], seed: int, arguments: dict[str, Any]) -> None: ...
+
+    @classmethod
+    @abstractmethod
+    def check_arguments(cls, arguments: dict[str, Any], where: str) -> None:
+        """Check the names of the method's arguments.
+
+        :param arguments: as a plan gives them
+        :param where: that is, for the message
+        :raises ValueError: if there is one of which it has none
+        """
 
     @abstractmethod
     def learn(self, begin: int, end: int, every: int, check: Check) -> None:
@@ -83,6 +94,13 @@ class Learner(ABC):
         return None
 
 
+def _check_names(arguments: dict[str, Any], where: str, *takers: Callable[..., Any]) -> None:
+    known = {name for taker in takers for name in signature(taker).parameters} - {"self", "env", "seed", "policy", "kwargs"}
+    for name in arguments:
+        if name not in known:
+            raise ValueError(f"{where}: unknown argument {name!r}{did_you_mean(str(name), known)}.")
+
+
 def _recommended(env_id: str, arguments: dict[str, Any]) -> dict[str, Any]:
     """Return arguments of a skill graph: what is recommended for an environment, but for what is given."""
     recommended = {**load_hyperparams(env_id), **check_hyperparams(arguments, "arguments")}
@@ -98,6 +116,11 @@ class SkillGraphLearner(Learner):
     def __init__(self, env_id: str, env_kwargs: dict[str, Any], seed: int, arguments: dict[str, Any]) -> None:
         self.env = gym.make(env_id, **env_kwargs)
         self.agent = SkillGraphAgent(env=self.env, seed=seed, **_recommended(env_id, arguments))
+
+    @classmethod
+    def check_arguments(cls, arguments: dict[str, Any], where: str) -> None:
+        """They are those of the agent."""
+        check_hyperparams(arguments, where)
 
     @property
     def policy(self) -> Predictor:  # type: ignore[override]
@@ -199,6 +222,11 @@ class GoalConditionedLearner(Learner):
         env = gym.make(env_id, **{"terminate_on_success": True, **env_kwargs})
         self.policy: TD3 = type(self).make(env, seed=seed, **arguments)
 
+    @classmethod
+    def check_arguments(cls, arguments: dict[str, Any], where: str) -> None:
+        """They are those of DDPG, and the baseline's own."""
+        _check_names(arguments, where, cls.make, DDPG)
+
     def learn(self, begin: int, end: int, every: int, check: Check) -> None:
         """Learn in one go."""
         self.policy.learn(end, callback=_Checks(_checking(every, end, check)), log_interval=1_000_000)
@@ -246,6 +274,11 @@ class RecipeLearner(Learner):
         self.recipe = HindsightRecipe(env, seed=seed, **_recommended(env_id, arguments))
         self.policy: SkillGraphAgent = self.recipe.agent
 
+    @classmethod
+    def check_arguments(cls, arguments: dict[str, Any], where: str) -> None:
+        """They are those of the agent."""
+        check_hyperparams(arguments, where)
+
     def learn(self, begin: int, end: int, every: int, check: Check) -> None:
         """Learn in one go."""
         self.recipe.learn(end, _checking(every, end, check))
@@ -271,6 +304,11 @@ class CoveringOptionsLearner(Learner):
         given = {**arguments, "option_class": _COVERING_CLASSES[name]}
         self.policy: CoveringOptions = CoveringOptions(env, seed=seed, **given)
 
+    @classmethod
+    def check_arguments(cls, arguments: dict[str, Any], where: str) -> None:
+        """They are those of the class."""
+        _check_names(arguments, where, CoveringOptions)
+
     def learn(self, begin: int, end: int, every: int, check: Check) -> None:
         """Learn in one go."""
         self.policy.learn(end, _checking(every, end, check))
@@ -293,6 +331,11 @@ class RandomWalkLearner(Learner):
         assert isinstance(env.action_space, spaces.Box)
         self.policy = RandomWalk(env.action_space, seed, **arguments)
         env.close()
+
+    @classmethod
+    def check_arguments(cls, arguments: dict[str, Any], where: str) -> None:
+        """There are none."""
+        _check_names(arguments, where)
 
     def learn(self, begin: int, end: int, every: int, check: Check) -> None:
         """Only be tested."""

@@ -1,14 +1,16 @@
 """What is to be run: a YAML of methods, environments and seeds."""
 
+import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import yaml
 
 from sb3_skillgraph.experiments.learners import ALGORITHMS
-from sb3_skillgraph.hyperparams import check_hyperparams, did_you_mean
+from sb3_skillgraph.hyperparams import did_you_mean
 
 _COMMON = ("check_every", "pairs", "final_pairs", "test_pairs", "test_stretches")
 _TOP = {"methods": dict, "environments": dict, "seeds": list, **dict.fromkeys(_COMMON, int)}
@@ -73,31 +75,31 @@ def load_plan(path: Path) -> list[RunSpec]:
         raise ValueError(f"{path} is no valid YAML: {' '.join(str(error).split())}") from error
     top = _checked(document, _TOP, str(path), required=("methods", "environments", "seeds"))
     methods = {
-        str(name): _checked(value, _METHOD, f"{path}, method {name!r}", required=("algorithm",))
+        _name(name, path): _checked(value, _METHOD, f"{path}, method {name!r}", required=("algorithm",))
         for name, value in top["methods"].items()
     }
     for name, method in methods.items():
         if method["algorithm"] not in ALGORITHMS:
             hint = did_you_mean(method["algorithm"], ALGORITHMS)
             raise ValueError(f"{path}, method {name!r}: unknown algorithm {method['algorithm']!r}{hint}.")
-        if method["algorithm"] in ("skill_graph", "planning_off", "recipe"):
-            check_hyperparams(method.get("arguments", {}), f"{path}, method {name!r}")
+        ALGORITHMS[method["algorithm"]].check_arguments(method.get("arguments", {}), f"{path}, method {name!r}")
     environments = {
-        str(name): _checked(value, _ENVIRONMENT, f"{path}, environment {name!r}", required=("id", "steps"))
+        _name(name, path): _checked(value, _ENVIRONMENT, f"{path}, environment {name!r}", required=("id", "steps"))
         for name, value in top["environments"].items()
     }
     specs = []
     for label, env in environments.items():
+        _check_id(env["id"], f"{path}, environment {label!r}")
         unknown = [name for name in env.get("methods", ()) if name not in methods]
         if unknown:
             raise ValueError(
-                f"{path}, environment {label!r}: unknown method {unknown[0]!r}{did_you_mean(unknown[0], methods)}."
+                f"{path}, environment {label!r}: unknown method {unknown[0]!r}{did_you_mean(str(unknown[0]), methods)}."
             )
         specs += [
             RunSpec(
                 name,
                 label,
-                int(seed),
+                seed,
                 methods[name]["algorithm"],
                 env["id"],
                 env["steps"],
@@ -105,10 +107,36 @@ def load_plan(path: Path) -> list[RunSpec]:
                 env_kwargs=env.get("kwargs", {}),
                 **{name: given[name] for given in (top, env) for name in _COMMON if name in given},
             )
-            for seed in env.get("seeds", top["seeds"])
+            for seed in _seeds(env.get("seeds", top["seeds"]), f"{path}, environment {label!r}")
             for name in env.get("methods", methods)
         ]
     return specs
+
+
+def _name(name: Any, path: Path) -> str:
+    """Check what a folder is to be called."""
+    if not isinstance(name, str) or not re.fullmatch(r"\w[\w.+-]*", name):
+        raise ValueError(
+            f"{path}: {name!r} is no name for a method or an environment: a folder is called so, by letters, digits and "
+            ". + - _ (in quotes where YAML takes it for something else)."
+        )
+    return name
+
+
+def _seeds(seeds: list[Any], where: str) -> list[int]:
+    for seed in seeds:
+        if type(seed) is not int or seed < 0:
+            raise ValueError(f"{where}: a seed must be a whole number, 0 or more, not {seed!r}.")
+    if len(set(seeds)) < len(seeds):
+        raise ValueError(f"{where}: a seed stands twice in {seeds}.")
+    return seeds
+
+
+def _check_id(id: str, where: str) -> None:
+    try:
+        gym.spec(id)
+    except (gym.error.Error, ImportError) as error:
+        raise ValueError(f"{where}: {error}") from error
 
 
 def _checked(value: Any, keys: Mapping[str, type], where: str, required: tuple[str, ...]) -> dict[str, Any]:

@@ -27,21 +27,22 @@ from sb3_skillgraph.run_folder import CONFIG, PROGRESS, STEPS, checkpoints, read
 DONE, ERROR, LOCK = "done.json", "error.txt", "lock"
 SECONDS = "time/seconds"
 STRETCH = 1_000  # environment steps between tests at test time: an episode
-Outcome = Literal["done", "skipped", "elsewhere", "failed"]
+Outcome = Literal["done", "skipped", "elsewhere", "failed", "refused"]
 
 
 class RunStatus(NamedTuple):
     """How a run stands.
 
     :param spec: the run
-    :param state: ``done``, ``running``, ``failed``, ``stopped`` (to be resumed) or ``waiting``
+    :param state: ``done``, ``running``, ``failed``, ``stopped`` (to be resumed), ``waiting``, or ``other`` where the folder
+        holds a run with other settings
     :param steps: environment steps done, those that will not have to be done again
     :param seconds_left: estimate, without tests; None before the first check
     :param success_rate: last measured; None before the first check
     """
 
     spec: RunSpec
-    state: Literal["done", "running", "failed", "stopped", "waiting"]
+    state: Literal["done", "running", "failed", "stopped", "waiting", "other"]
     steps: int
     seconds_left: float | None
     success_rate: float | None
@@ -96,18 +97,47 @@ def _engine(backend: str, n_jobs: int) -> AbstractContextManager[Any]:
 
 
 def _dask_client(n_jobs: int) -> AbstractContextManager[Any]:
+    import dask  # type: ignore[import-not-found, unused-ignore]
     from distributed import Client, get_client  # type: ignore[import-not-found, unused-ignore]
 
     try:
         return nullcontext(get_client())
     except ValueError:
         # Of the scheduler that Dask's configuration names, or of this machine; runs must not share their generators.
-        client: AbstractContextManager[Any] = Client(n_workers=n_jobs, threads_per_worker=1, dashboard_address=None)
+        named = dask.config.get("scheduler-address", None) is not None
+        here: dict[str, Any] = dict(n_workers=n_jobs, threads_per_worker=1, dashboard_address=None)
+        client: AbstractContextManager[Any] = Client(**({} if named else here))
         return client
+
+
+def is_done(spec: RunSpec, out: Path) -> bool:
+    """Tell whether a run is finished; one with other settings that lies in its place does not count.
+
+    :param spec: the run
+    :param out: folder for all runs
+    """
+    return (spec.folder(out) / DONE).exists() and not has_other_settings(spec, out)
+
+
+def has_other_settings(spec: RunSpec, out: Path) -> bool:
+    """Tell whether something has been done in a run's place with other settings.
+
+    :param spec: the run
+    :param out: folder for all runs
+    """
+    folder = spec.folder(out)
+    begun = (folder / DONE).exists() or (folder / PROGRESS).exists() or bool(checkpoints(folder))
+    if not begun or not (folder / CONFIG).exists():
+        return False
+    before = json.loads((folder / CONFIG).read_text())
+    del before["versions"]
+    return bool(before != json.loads(json.dumps(spec.as_plain())))
 
 
 def run(spec: RunSpec, out: Path) -> Outcome:
     """Do one run, from its last checkpoint if there is one; an error is written into its folder.
+
+    What has been done there with other settings is left alone, and the run refused.
 
     :param spec: the run
     :param out: folder for all runs
@@ -118,12 +148,12 @@ def run(spec: RunSpec, out: Path) -> Outcome:
     try:
         # The lock falls with the process that holds it, however that ends.
         with FileLock(folder / LOCK, timeout=1):  # a look at its status takes the lock for a moment
+            if has_other_settings(spec, out):
+                return "refused"
+            if (folder / DONE).exists():
+                return "skipped"
             try:
-                this = _Run(spec, folder)
-                this.check_config()
-                if (folder / DONE).exists():
-                    return "skipped"
-                this.do()
+                _Run(spec, folder).do()
             except Exception:
                 write_atomically(folder / ERROR, traceback.format_exc())
                 return "failed"
@@ -144,6 +174,7 @@ class _Run:
     def do(self) -> None:
         spec, folder = self.spec, self.folder
         (folder / ERROR).unlink(missing_ok=True)
+        write_atomically(folder / CONFIG, json.dumps({**spec.as_plain(), "versions": versions()}, indent=1) + "\n")
         self.learner = ALGORITHMS[spec.algorithm](spec.env_id, spec.env_kwargs, spec.seed, spec.arguments)
         begin = self._resume(self.learner)
         self._clock = time.perf_counter()
@@ -168,15 +199,6 @@ class _Run:
             **self.learner.summary(),
         }
         write_atomically(folder / DONE, json.dumps(document, indent=1) + "\n")
-
-    def check_config(self) -> None:
-        path, config = self.folder / CONFIG, json.loads(json.dumps(self.spec.as_plain()))
-        if path.exists():
-            before = {name: value for name, value in json.loads(path.read_text()).items() if name != "versions"}
-            if before != config:
-                raise ValueError(f"{self.folder} holds a run with another configuration: remove it, or choose another folder.")
-        else:
-            write_atomically(path, json.dumps({**config, "versions": versions()}, indent=1) + "\n")
 
     def _resume(self, learner: Learner) -> int:
         """Load the newest checkpoint and drop what was written after it; return the steps done."""
@@ -274,10 +296,13 @@ def status(specs: Sequence[RunSpec], out: Path) -> list[RunStatus]:
     :param specs: the runs
     :param out: folder for all of them
     """
-    return [_status(spec, spec.folder(out)) for spec in specs]
+    return [_status(spec, out) for spec in specs]
 
 
-def _status(spec: RunSpec, folder: Path) -> RunStatus:
+def _status(spec: RunSpec, out: Path) -> RunStatus:
+    if has_other_settings(spec, out):
+        return RunStatus(spec, "other", 0, None, None)
+    folder = spec.folder(out)
     rows = read_progress(folder)
     steps = int(rows[-1][STEPS]) if rows else 0
     rate = float(rows[-1]["eval/success_rate"]) if rows else None
