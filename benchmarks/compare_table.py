@@ -5,6 +5,8 @@ python -m benchmarks.compare_table benchmarks/compare.yml benchmarks/results/com
 
 import argparse
 import csv
+import json
+import math
 import pathlib
 import warnings
 from typing import Any
@@ -13,7 +15,7 @@ import numpy as np
 from scipy.stats import ttest_ind
 
 from sb3_skillgraph.experiments.plan import load_plan
-from sb3_skillgraph.experiments.runner import RunStatus, status
+from sb3_skillgraph.experiments.runner import DONE, RunStatus, status
 from sb3_skillgraph.experiments.summary import estimate
 
 # What Figure 5 of the paper shows, and what it leaves open: is it the planning, or hindsight, or events?
@@ -39,7 +41,14 @@ def grouped(done: list[RunStatus]) -> dict[tuple[str, str], list[RunStatus]]:
     return groups
 
 
-def summarise(groups: dict[tuple[str, str], list[RunStatus]]) -> list[dict[str, Any]]:
+def steps_to_goals(runs: list[RunStatus], out: pathlib.Path) -> float:
+    """Return how many environment steps the goals that were reached took, in the mean; no number if none was."""
+    documents = [json.loads((run.spec.folder(out) / DONE).read_text()) for run in runs]
+    steps = [pair["steps"] for document in documents for pair in document["pairs"] if pair["success"]]
+    return float(np.mean(steps)) if steps else math.nan
+
+
+def summarise(groups: dict[tuple[str, str], list[RunStatus]], out: pathlib.Path) -> list[dict[str, Any]]:
     """Return a row for every method on every environment that has a finished run, the best first."""
     rows = []
     for (environment, method), runs in groups.items():
@@ -57,6 +66,7 @@ def summarise(groups: dict[tuple[str, str], list[RunStatus]]) -> list[dict[str, 
                 "high": high,
                 "worst": scores.min(),
                 "best": scores.max(),
+                "steps_to_goals_reached": steps_to_goals(runs, out),
             }
         )
     order = list(dict.fromkeys(row["environment"] for row in rows))
@@ -113,6 +123,7 @@ def line(row: dict[str, Any]) -> str:
         f"{row['iqm']:.3f} ({row['low']:.3f} to {row['high']:.3f})",
         f"{row['worst']:.2f} to {row['best']:.2f}",
         str(row["seeds"]),
+        "-" if math.isnan(row["steps_to_goals_reached"]) else f"{row['steps_to_goals_reached']:.0f}",
     ]
     return f"| {' | '.join(cells)} |"
 
@@ -127,9 +138,10 @@ def main() -> None:
     if not done:
         raise SystemExit(f"no run of {args.plan} is finished in {args.out}")
     groups = grouped(done)
-    rows, compared = summarise(groups), compare(groups)
+    rows, compared = summarise(groups, args.out), compare(groups)
     write(args.out / f"{args.plan.stem}_summary.csv", rows)
-    print(table(["Task", "Steps", "Method", "Mean", "IQM (95 %)", "Seeds' range", "Seeds"], [*map(line, rows)]))
+    columns = ["Task", "Steps", "Method", "Mean", "IQM (95 %)", "Seeds' range", "Seeds", "Steps to goals reached"]
+    print(table(columns, [*map(line, rows)]))
     if compared:
         write(args.out / f"{args.plan.stem}_order.csv", compared)
         print()

@@ -12,6 +12,7 @@ from typing import Any
 
 import dask
 import distributed
+import gymnasium as gym
 import numpy as np
 import pytest
 import yaml
@@ -24,6 +25,7 @@ from sb3_skillgraph.experiments import RunSpec, compare, load_plan, run, runner,
 from sb3_skillgraph.experiments.figures import method_curves, practice_curves
 from sb3_skillgraph.experiments.summary import estimate, interquartile_mean
 from sb3_skillgraph.run_folder import checkpoints, read_progress
+from sb3_skillgraph.smdp import SMDPQLearning
 
 SMALL_NETS = {
     "policy_kwargs": {"net_arch": [16, 16]},
@@ -77,6 +79,13 @@ def test_a_run_leaves_everything_and_is_not_done_again(algorithm: str, tmp_path:
     assert [row["time/total_timesteps"] for row in progress(folder)] == (
         ["400"] if algorithm == "random_walk" else ["200", "400"]
     )
+    saved = checkpoints(folder)[400]
+    assert any(saved.iterdir()) == (algorithm != "random_walk")
+    if algorithm == "covering_options":
+        observation = gym.make(TOY).reset(seed=0)[0]
+        model = SMDPQLearning.load(saved / "q_learning.zip")
+        seen = {**observation, "action_mask": np.ones(model.action_space.n, dtype=np.int8)}
+        assert model.action_space.contains(int(model.predict(seen, deterministic=True)[0]))
     done = json.loads((folder / "done.json").read_text())
     assert len(done["pairs"]) == 4
     assert done["success_rate"] == pytest.approx(sum(pair["success"] for pair in done["pairs"]) / 4)

@@ -3,6 +3,7 @@
 import copy
 import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -244,6 +245,15 @@ class CoveringOptions:
         twin.model.exploration_schedule = LinearSchedule(least, least, 1.0)
         return twin
 
+    def save(self, folder: Path) -> None:
+        """Save Q-learning as ``q_learning.zip``, an SB3 model, and the options' policies as ``c0.zip``, ``c1.zip``, ...
+
+        :param folder: where to, an existing folder
+        """
+        self.model.save(folder / "q_learning.zip")
+        for option in self.options:
+            option.learner.policy.save(str(folder / f"{option.id}.zip"))
+
     def predict(
         self,
         observation: np.ndarray | dict[str, np.ndarray],
@@ -376,6 +386,9 @@ class _QLearning(SMDPQLearning):
         for _ in range(self.budget.updates_due - self._n_updates):
             super().train(1, batch_size)
             polyak_update(self.q_net.parameters(), self.q_net_target.parameters(), self.tau)
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "budget"]
 
     def _update_current_progress_remaining(self, num_timesteps: int, total_timesteps: int) -> None:
         self._current_progress_remaining = self.budget.share_left

@@ -20,7 +20,7 @@ from sb3_skillgraph.evaluation import Predictor
 from sb3_skillgraph.hyperparams import check_hyperparams, did_you_mean, load_hyperparams
 from sb3_skillgraph.options.learner import OptionDDPG, OptionTD3
 from sb3_skillgraph.plotting import event_links, near_links
-from sb3_skillgraph.run_folder import load_agent, save_agent, stops
+from sb3_skillgraph.run_folder import AGENT, load_agent, save_agent, stops
 
 Check = Callable[[int], None]
 _COVERING_CLASSES = {"OptionDDPG": OptionDDPG, "OptionTD3": OptionTD3}
@@ -62,8 +62,9 @@ class Learner(ABC):
         :param check: called with the number of steps
         """
 
-    def save(self, folder: Path) -> None:  # noqa: B027 - only resumable learners have something to save
-        """Take a checkpoint.
+    @abstractmethod
+    def save(self, folder: Path) -> None:
+        """Take a checkpoint: all that is needed to go on, if that is possible, else what has been learned.
 
         :param folder: an empty folder
         """
@@ -232,6 +233,10 @@ class GoalConditionedLearner(Learner):
         self.policy.learn(end, callback=_Checks(_checking(every, end, check)), log_interval=1_000_000)
         check(end)
 
+    def save(self, folder: Path) -> None:
+        """Save the model."""
+        self.policy.save(folder / "model.zip")
+
     def practise(self, env: gym.Env, start: np.ndarray, goal: np.ndarray, stretches: list[int]) -> Iterator[Predictor]:
         """Let a copy go on learning."""
         model, experience = io.BytesIO(), io.BytesIO()
@@ -284,6 +289,10 @@ class RecipeLearner(Learner):
         self.recipe.learn(end, _checking(every, end, check))
         check(end)
 
+    def save(self, folder: Path) -> None:
+        """Save the agent."""
+        self.policy.save(folder / AGENT)
+
     def practise(self, env: gym.Env, start: np.ndarray, goal: np.ndarray, stretches: list[int]) -> Iterator[Predictor]:
         """Let a copy go on learning."""
         twin = self.recipe.copy(env)
@@ -314,6 +323,10 @@ class CoveringOptionsLearner(Learner):
         self.policy.learn(end, _checking(every, end, check))
         check(end)
 
+    def save(self, folder: Path) -> None:
+        """Save what chooses, and the options' policies."""
+        self.policy.save(folder)
+
     def practise(self, env: gym.Env, start: np.ndarray, goal: np.ndarray, stretches: list[int]) -> Iterator[Predictor]:
         """Let a copy go on learning."""
         twin = self.policy.copy(env)
@@ -340,6 +353,9 @@ class RandomWalkLearner(Learner):
     def learn(self, begin: int, end: int, every: int, check: Check) -> None:
         """Only be tested."""
         check(end)
+
+    def save(self, folder: Path) -> None:
+        """There is nothing to save."""
 
     def practise(self, env: gym.Env, start: np.ndarray, goal: np.ndarray, stretches: list[int]) -> Iterator[Predictor]:
         """Only be tested."""

@@ -4,6 +4,7 @@ import csv
 import io
 import json
 import os
+import shutil
 import time
 import traceback
 from collections.abc import Sequence
@@ -203,7 +204,11 @@ class _Run:
     def _resume(self, learner: Learner) -> int:
         """Load the newest checkpoint and drop what was written after it; return the steps done."""
         saved = checkpoints(self.folder)
-        steps = max(saved, default=0) if learner.resumable else 0
+        if not learner.resumable:
+            for path in saved.values():
+                shutil.rmtree(path)
+            saved = {}
+        steps = max(saved, default=0)
         if steps:
             learner.load(saved[steps])
         self.rows = [row for row in read_progress(self.folder) if int(row[STEPS]) <= steps]
@@ -228,8 +233,7 @@ class _Run:
         if snapshot is not None:
             document = json.dumps({"steps": n_steps, **snapshot})
             write_atomically(self.folder / f"graph_{n_steps}.json", document + "\n")
-        if self.learner.resumable:
-            take_checkpoint(self.folder, n_steps, self.learner.save)
+        take_checkpoint(self.folder, n_steps, self.learner.save)
         self._clock = time.perf_counter()
 
     def _test(self, n_steps: int) -> PairsResult:
@@ -313,7 +317,7 @@ def _status(spec: RunSpec, out: Path) -> RunStatus:
     a_step = float(rows[-1][SECONDS]) / steps if rows else None
     if _is_locked(folder):
         return RunStatus(spec, "running", steps, a_step and a_step * (total - steps), rate)
-    kept = max(checkpoints(folder), default=0)
+    kept = max(checkpoints(folder), default=0) if ALGORITHMS[spec.algorithm].resumable else 0
     left = a_step and a_step * (total - kept)
     if (folder / ERROR).exists():
         return RunStatus(spec, "failed", kept, left, rate)
