@@ -11,7 +11,15 @@ from conftest import TOY
 from stable_baselines3 import DDPG, HerReplayBuffer
 
 from sb3_skillgraph import evaluate_pairs
-from sb3_skillgraph.baselines import CoveringOptions, GoalSchedule, HindsightRecipe, OptionTask, make_her, make_uvfa
+from sb3_skillgraph.baselines import (
+    CoveringOptions,
+    GoalSchedule,
+    HindsightRecipe,
+    OptionTask,
+    RandomWalk,
+    make_her,
+    make_uvfa,
+)
 from sb3_skillgraph.baselines.covering_options import TERMINATION_SHARE, LowEnd
 from sb3_skillgraph.options.learner import OptionTD3
 from sb3_skillgraph.options.option import goal_rule
@@ -198,8 +206,13 @@ def test_steps_are_the_environments_and_decisions_fewer(covering: CoveringOption
     assert covering.model.num_timesteps < covering.num_timesteps
     assert covering.model.exploration_rate == pytest.approx(0.1)
     assert covering.model._n_updates == pytest.approx(covering.num_timesteps / covering.train_freq, abs=covering.env.timeout)
-    result = evaluate_pairs(covering, TOY, env_kwargs={"maze_map": CORRIDOR}, n_pairs=5)
-    assert len(result.pairs) == 5
+
+
+def test_covering_options_reach_goals(covering: CoveringOptions) -> None:
+    corridor = {"maze_map": CORRIDOR, "max_steps": 60}
+    walk = RandomWalk(covering.env.unwrapped.action_space, seed=0)
+    assert evaluate_pairs(walk, TOY, env_kwargs=corridor, n_pairs=40).success_rate < 0.2
+    assert evaluate_pairs(covering, TOY, env_kwargs=corridor, n_pairs=40).success_rate >= 0.5
 
 
 def test_an_ants_primitive_action_is_a_step_of_a_global_option() -> None:

@@ -364,6 +364,18 @@ def test_q_learning_finds_the_values_of_a_small_smdp(n_envs: int) -> None:
     assert actions.tolist() == exact().argmax(axis=1).tolist()
 
 
+def test_the_target_network_values_what_the_other_chooses() -> None:
+    policy = SMDPQLearning("MultiInputPolicy", SmallSMDP(), seed=0, policy_kwargs={"net_arch": []}).policy
+    with th.no_grad():
+        for network, weights in ((policy.q_net, [[1.0, 2.0, 3.0]]), (policy.q_net_target, [[30.0, 20.0, 10.0]])):
+            network.q_net[0].weight.copy_(th.tensor(weights).T.expand(3, 4))
+            network.q_net[0].bias.zero_()
+        masks = th.tensor([[1, 1, 1], [1, 1, 0], [1, 0, 0]])
+        values = policy.q_net_target({"observation": th.eye(4)[:3], "action_mask": masks}).max(dim=1).values
+    assert values.tolist() == [10.0, 20.0, 30.0]
+    assert not any("followed" in name for name in policy.state_dict())
+
+
 def test_q_learning_learns_on_options_and_is_saved(agent: SkillGraphAgent, tmp_path: Any) -> None:
     env = Monitor(lifted(agent))
     model = SMDPQLearning("MultiInputPolicy", env, learning_starts=50, train_freq=1, gamma=GAMMA, seed=0).learn(300)

@@ -192,10 +192,10 @@ class CoveringOptions:
         self.model = _QLearning(
             "MultiInputPolicy",
             Monitor(self.env),
-            learning_rate=1e-3,
+            learning_rate=1e-4,  # with 1e-3, or a target that follows faster, values grow far beyond what can be earned
             learning_starts=100,
             batch_size=batch_size,
-            tau=0.005,
+            tau=1e-3,
             gamma=gamma,
             target_update_interval=sys.maxsize,  # after every update instead
             exploration_fraction=0.75,

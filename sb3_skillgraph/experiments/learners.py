@@ -303,7 +303,10 @@ class RecipeLearner(Learner):
 
 
 class CoveringOptionsLearner(Learner):
-    """Deep covering options under SMDP Q-learning."""
+    """Deep covering options under SMDP Q-learning, tested with the exploration it ends learning with.
+
+    A choice that leads nowhere would otherwise be repeated until the episode is over.
+    """
 
     def __init__(self, env_id: str, env_kwargs: dict[str, Any], seed: int, arguments: dict[str, Any]) -> None:
         env = gym.make(env_id, **{"terminate_on_success": True, **env_kwargs})
@@ -311,7 +314,8 @@ class CoveringOptionsLearner(Learner):
         if name not in _COVERING_CLASSES:
             raise ValueError(f"option_class is {' or '.join(_COVERING_CLASSES)} for covering options, not {name!r}.")
         given = {**arguments, "option_class": _COVERING_CLASSES[name]}
-        self.policy: CoveringOptions = CoveringOptions(env, seed=seed, **given)
+        self.learner = CoveringOptions(env, seed=seed, **given)
+        self.policy = _Exploring(self.learner)
 
     @classmethod
     def check_arguments(cls, arguments: dict[str, Any], where: str) -> None:
@@ -320,20 +324,39 @@ class CoveringOptionsLearner(Learner):
 
     def learn(self, begin: int, end: int, every: int, check: Check) -> None:
         """Learn in one go."""
-        self.policy.learn(end, _checking(every, end, check))
+        self.learner.learn(end, _checking(every, end, check))
         check(end)
 
     def save(self, folder: Path) -> None:
         """Save what chooses, and the options' policies."""
-        self.policy.save(folder)
+        self.learner.save(folder)
 
     def practise(self, env: gym.Env, start: np.ndarray, goal: np.ndarray, stretches: list[int]) -> Iterator[Predictor]:
         """Let a copy go on learning."""
-        twin = self.policy.copy(env)
-        yield twin
+        twin = self.learner.copy(env)
+        yield _Exploring(twin)
         for n_steps in stretches:
             twin.learn(n_steps)
-            yield twin
+            yield _Exploring(twin)
+
+
+class _Exploring:
+    def __init__(self, learner: CoveringOptions) -> None:
+        self.learner = learner
+
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        model = self.learner.model
+        rate, model.exploration_rate = model.exploration_rate, model.exploration_final_eps
+        try:
+            return self.learner.predict(observation, state, episode_start)
+        finally:
+            model.exploration_rate = rate  # for what it learns from later
 
 
 class RandomWalkLearner(Learner):

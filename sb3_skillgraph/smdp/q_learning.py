@@ -9,7 +9,7 @@ from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.torch_layers import CombinedExtractor
-from stable_baselines3.common.type_aliases import PyTorchObs
+from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.dqn.dqn import DQN
 from stable_baselines3.dqn.policies import DQNPolicy, QNetwork
 
@@ -17,7 +17,13 @@ from sb3_skillgraph.smdp.options_env import MASK
 
 
 class MaskedQNetwork(QNetwork):
-    """A Q-network that gives masked actions a value of minus infinity, so that no maximum is ever theirs."""
+    """A Q-network that gives masked actions a value of minus infinity, so that no maximum is ever theirs.
+
+    As a target network it does so to all but the action that the network it follows would choose (double Q-learning, van
+    Hasselt et al. 2016): the maximum of its values is then the value it gives to that network's choice.
+    """
+
+    _followed: tuple[QNetwork, ...] = ()
 
     def forward(self, obs: PyTorchObs) -> th.Tensor:
         """
@@ -29,13 +35,30 @@ class MaskedQNetwork(QNetwork):
         values = super().forward(obs)
         if isinstance(obs, dict) and MASK in obs:
             values = values.masked_fill(obs[MASK] == 0, -th.inf)
+        if self._followed:
+            chosen = self._followed[0](obs).argmax(dim=1, keepdim=True)
+            values = th.full_like(values, -th.inf).scatter(1, chosen, values.gather(1, chosen))
         return values
+
+    def follow(self, network: QNetwork) -> None:
+        """Become the target network of another.
+
+        :param network: the network that learns
+        """
+        self._followed = (network,)  # in a tuple, it is no part of this module
 
 
 class MaskedPolicy(DQNPolicy):
-    """DQN's policy with masked Q-networks."""
+    """DQN's policy with masked Q-networks, which learn by double Q-learning."""
 
-    def make_q_net(self) -> QNetwork:
+    q_net: MaskedQNetwork
+    q_net_target: MaskedQNetwork
+
+    def _build(self, lr_schedule: Schedule) -> None:
+        super()._build(lr_schedule)
+        self.q_net_target.follow(self.q_net)
+
+    def make_q_net(self) -> MaskedQNetwork:
         """Make one network, with a features extractor of its own."""
         net_args = self._update_features_extractor(self.net_args, features_extractor=None)
         return MaskedQNetwork(**net_args).to(self.device)
@@ -108,7 +131,8 @@ class SMDPDictReplayBuffer(_Discounts, DictReplayBuffer):
 class SMDPQLearning(DQN):
     """
     SMDP Q-learning (Bradtke & Duff 1995) by SB3's DQN: what follows an option that took tau steps is discounted by
-    ``gamma ** tau``, and only options that can start are explored, chosen and bootstrapped from.
+    ``gamma ** tau``, and only options that can start are explored, chosen and bootstrapped from. The network that learns
+    chooses what is bootstrapped from, the target network tells its value (double Q-learning).
 
     Made for :class:`~sb3_skillgraph.OptionsEnv`; it learns on any environment with Discrete actions. ``info["discount"]``
     is each transition's discount (``gamma`` where there is none) and a Dict observation's ``action_mask`` its mask. Goals
