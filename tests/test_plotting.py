@@ -118,6 +118,11 @@ def test_save_figure_makes_folders(agent, tmp_path):
     assert path.read_bytes().startswith(b"\x89PNG")
 
 
+def test_a_picture_needs_an_ending(agent, tmp_path):
+    with pytest.raises(ValueError, match="no ending"):
+        save_figure(plot_skill_graph(agent), tmp_path / "graph")
+
+
 def test_project_takes_any_dimension():
     assert project(np.ones((4, 5))).shape == (4, 2)
     np.testing.assert_allclose(project(np.array([[3.0]])), [[3.0, 0.0]])

@@ -82,8 +82,11 @@ def save_figure(axes: Axes, path: str | Path) -> None:
 
     :param axes: axes of the figure
     :param path: file; its ending tells the format
+    :raises ValueError: if it has none, or one that is not known
     """
     path = Path(path)
+    if not path.suffix:
+        raise ValueError(f"{path} has no ending that tells what picture to make: .png, .svg or .pdf.")
     path.parent.mkdir(parents=True, exist_ok=True)
     figure = axes.get_figure(root=True)
     assert figure is not None
