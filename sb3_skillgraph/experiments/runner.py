@@ -175,9 +175,10 @@ class _Run:
     def do(self) -> None:
         spec, folder = self.spec, self.folder
         (folder / ERROR).unlink(missing_ok=True)
-        write_atomically(folder / CONFIG, json.dumps({**spec.as_plain(), "versions": versions()}, indent=1) + "\n")
         self.learner = ALGORITHMS[spec.algorithm](spec.env_id, spec.env_kwargs, spec.seed, spec.arguments)
         begin = self._resume(self.learner)
+        if not begin:
+            write_atomically(folder / CONFIG, json.dumps({**spec.as_plain(), "versions": versions()}, indent=1) + "\n")
         self._clock = time.perf_counter()
         if begin < spec.steps:
             self.learner.learn(begin, spec.steps, spec.check_every, self._check)
