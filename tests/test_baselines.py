@@ -93,6 +93,12 @@ def test_a_baseline_is_paid_as_options_are_paid() -> None:
         before = after
 
 
+def test_uvfa_learns_where_chance_finds_goals() -> None:
+    model = make_uvfa(AnyStart(toy(maze_map=CORRIDOR)), seed=1, goal_freq=1, learning_starts=200).learn(4_000)
+    corridor = {"maze_map": CORRIDOR, "max_steps": 60}
+    assert evaluate_pairs(model, TOY, env_kwargs=corridor, n_pairs=40).success_rate >= 0.35  # a random walk: below 0.1
+
+
 def test_the_recipe_learns_without_a_graph() -> None:
     seen: list[int] = []
     recipe = HindsightRecipe(toy(), seed=0, learning_starts=300, batch_size=64).learn(4_000, seen.append)
