@@ -234,16 +234,18 @@ def test_monitor_counts_decisions_and_seeds_repeat(agent: SkillGraphAgent) -> No
 # -- two high levels --------------------------------------------------------------------------------------------------
 
 
-def test_the_graph_plans_on_it(agent: SkillGraphAgent) -> None:
+def test_the_graph_plans_on_it() -> None:
+    agent = new_agent(seed=3).learn(2_500)
     env = lifted(agent, route=agent.planner.route)
     policy = GraphPolicy(agent.planner, env)
+    env.reset(seed=0)
     rewards, lengths = evaluate_policy(policy, Monitor(env), n_eval_episodes=20, return_episode_rewards=True)
     assert len(rewards) == len(lengths) == 20
-    successes = np.array(rewards) > 0
     agent.planning = False
+    env.reset(seed=0)
     straight, _ = evaluate_policy(agent, Monitor(env.env), n_eval_episodes=20, return_episode_rewards=True)
-    agent.planning = True
-    assert successes.mean() >= max(0.5, np.mean(np.array(straight) > 0) - 0.1)
+    assert np.mean(np.array(rewards) > 0) >= 0.7  # 0.92 to 1.00 with three seeds of the agent
+    assert np.mean(np.array(rewards) > 0) >= np.mean(np.array(straight) > 0)
 
 
 def test_the_graph_remembers_failures_for_each_environment(agent: SkillGraphAgent) -> None:
