@@ -15,7 +15,7 @@ import numpy as np
 from scipy.stats import ttest_ind
 
 from sb3_skillgraph.experiments.plan import load_plan
-from sb3_skillgraph.experiments.runner import DONE, RunStatus, status
+from sb3_skillgraph.experiments.runner import DONE, RunStatus, by_method, status
 from sb3_skillgraph.experiments.summary import estimate
 
 # What Figure 5 of the paper shows, and what it leaves open: is it the planning, or hindsight, or events?
@@ -31,14 +31,6 @@ ORDER = [
     ("dsg-frontier", "global-option-ways"),
     ("dco-10", "random-walk"),
 ]
-
-
-def grouped(done: list[RunStatus]) -> dict[tuple[str, str], list[RunStatus]]:
-    """Return the runs of every environment and method."""
-    groups: dict[tuple[str, str], list[RunStatus]] = {}
-    for run in done:
-        groups.setdefault((run.spec.environment, run.spec.method), []).append(run)
-    return groups
 
 
 def steps_to_goals(runs: list[RunStatus], out: pathlib.Path) -> float:
@@ -137,7 +129,7 @@ def main() -> None:
     done = [run for run in status(load_plan(args.plan), args.out) if run.state == "done"]
     if not done:
         raise SystemExit(f"no run of {args.plan} is finished in {args.out}")
-    groups = grouped(done)
+    groups = by_method(done)
     rows, compared = summarise(groups, args.out), compare(groups)
     write(args.out / f"{args.plan.stem}_summary.csv", rows)
     columns = ["Task", "Steps", "Method", "Mean", "IQM (95 %)", "Seeds' range", "Seeds", "Steps to goals reached"]

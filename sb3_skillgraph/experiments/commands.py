@@ -12,7 +12,7 @@ from rich.table import Table
 from sb3_skillgraph.console import UserError, for_people, positive
 from sb3_skillgraph.experiments.figures import redraw
 from sb3_skillgraph.experiments.plan import RunSpec, load_plan
-from sb3_skillgraph.experiments.runner import ERROR, RunStatus, compare, status
+from sb3_skillgraph.experiments.runner import ERROR, RunStatus, by_method, compare, status
 from sb3_skillgraph.experiments.summary import estimate
 from sb3_skillgraph.plotting import save_figure
 
@@ -118,8 +118,7 @@ def _print_status(runs: list[RunStatus]) -> None:
         table.add_column(column, no_wrap=True)
     for column in ("done", "running", "failed", "steps", "success (IQM, 95 %)", "time left, one by one"):
         table.add_column(column, justify="right")
-    for environment, method in dict.fromkeys((run.spec.environment, run.spec.method) for run in runs):
-        here = [run for run in runs if (run.spec.environment, run.spec.method) == (environment, method)]
+    for (environment, method), here in by_method(runs).items():
         states = Counter(run.state for run in here)
         scores = [run.success_rate for run in here if run.state == "done" and run.success_rate is not None]
         success = "-"

@@ -344,17 +344,11 @@ class _Exploring:
     def __init__(self, learner: CoveringOptions) -> None:
         self.learner = learner
 
-    def predict(
-        self,
-        observation: np.ndarray | dict[str, np.ndarray],
-        state: tuple[np.ndarray, ...] | None = None,
-        episode_start: np.ndarray | None = None,
-        deterministic: bool = False,
-    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+    def predict(self, *args: Any, **kwargs: Any) -> Any:
         model = self.learner.model
         rate, model.exploration_rate = model.exploration_rate, model.exploration_final_eps
         try:
-            return self.learner.predict(observation, state, episode_start)
+            return self.learner.predict(*args, **{**kwargs, "deterministic": False})
         finally:
             model.exploration_rate = rate  # for what it learns from later
 

@@ -304,6 +304,18 @@ def status(specs: Sequence[RunSpec], out: Path) -> list[RunStatus]:
     return [_status(spec, out) for spec in specs]
 
 
+def by_method(runs: Sequence[RunStatus]) -> dict[tuple[str, str], list[RunStatus]]:
+    """Group runs by environment and method.
+
+    :param runs: how they stand
+    :return: in the order of their first
+    """
+    groups: dict[tuple[str, str], list[RunStatus]] = {}
+    for run in runs:
+        groups.setdefault((run.spec.environment, run.spec.method), []).append(run)
+    return groups
+
+
 def _status(spec: RunSpec, out: Path) -> RunStatus:
     if has_other_settings(spec, out):
         return RunStatus(spec, "other", 0, None, None)
