@@ -15,6 +15,7 @@ from sb3_skillgraph.baselines import (
     CoveringOptions,
     GoalSchedule,
     HindsightRecipe,
+    NewGoals,
     OptionTask,
     RandomWalk,
     make_her,
@@ -137,6 +138,52 @@ def test_the_recipe_ends_episodes_at_goals_and_falls_but_knows_them_apart() -> N
     falls = np.flatnonzero(store.stuck(np.arange(29)))
     assert len(falls) >= 5
     assert (np.diff(store._trajectory[:30])[falls] == 1).all()
+
+
+def test_a_new_goal_is_pursued_where_the_last_one_was_reached_or_given_up() -> None:
+    env = NewGoals(toy(terminate_on_success=False), n_steps=7)
+    before, _ = env.reset(seed=0, options={"goal": [-1.0, 1.0]})
+    np.testing.assert_array_equal(before["desired_goal"], [-1.0, 1.0])
+    rng, steps, lengths, reached = np.random.default_rng(0), 0, [], 0
+    for _ in range(300):
+        after, _, terminated, truncated, _ = env.step(rng.uniform(-1.0, 1.0, 2).astype(np.float32))
+        steps += 1
+        there = np.linalg.norm(after["achieved_goal"] - before["desired_goal"]) <= 0.45
+        changed = not np.array_equal(after["desired_goal"], before["desired_goal"])
+        assert changed == (there or steps == 7)
+        assert not terminated
+        if changed:
+            lengths.append(steps)
+            reached, steps = reached + there, 0
+        before = after
+        if truncated:
+            before, steps = env.reset()[0], 0
+    assert max(lengths) == 7 and reached >= 3
+
+
+def test_the_recipe_sees_no_end_where_its_goal_changes() -> None:
+    env = NewGoals(toy(terminate_on_success=False), n_steps=20)
+    store = HindsightRecipe(env, seed=0, learning_starts=10_000).learn(400).agent.store
+    goals = store.column("goal", np.arange(399))
+    assert len(np.unique(goals, axis=0)) >= 20
+    max_steps = int(env.get_wrapper_attr("max_steps"))
+    assert np.flatnonzero(np.diff(store._trajectory[:400])).tolist() == list(range(max_steps - 1, 399, max_steps))
+    assert not store.terminated(np.arange(400)).any()
+
+
+class Lazy(gym.Wrapper):
+    """Goes nowhere, whatever is done."""
+
+    def step(self, action: np.ndarray) -> Any:
+        return self.env.step(np.zeros(2, dtype=np.float32))
+
+
+def test_the_recipe_is_shaken_loose_where_it_stands_still() -> None:
+    silent = dict(learning_starts=0, gradient_steps=0, exploration_noise=0.0, random_action_prob=0.0)
+    recipe = HindsightRecipe(Lazy(toy()), seed=0, stall_steps=15, **silent).learn(30)
+    actions = recipe.agent.store.column("action", np.arange(30))
+    changes = np.flatnonzero(np.abs(np.diff(actions, axis=0)).max(axis=1) > 1e-6)
+    assert changes.tolist() in ([14, 24], [15, 25])
 
 
 def test_a_copy_of_the_recipe_leaves_the_recipe_alone() -> None:

@@ -3,6 +3,15 @@
 from sb3_skillgraph.baselines.covering_options import CoveringOptions
 from sb3_skillgraph.baselines.goal_conditioned import GoalSchedule, OptionTask, make_her, make_uvfa
 from sb3_skillgraph.baselines.random_walk import RandomWalk
-from sb3_skillgraph.baselines.recipe import HindsightRecipe
+from sb3_skillgraph.baselines.recipe import HindsightRecipe, NewGoals
 
-__all__ = ["CoveringOptions", "GoalSchedule", "HindsightRecipe", "OptionTask", "RandomWalk", "make_her", "make_uvfa"]
+__all__ = [
+    "CoveringOptions",
+    "GoalSchedule",
+    "HindsightRecipe",
+    "NewGoals",
+    "OptionTask",
+    "RandomWalk",
+    "make_her",
+    "make_uvfa",
+]

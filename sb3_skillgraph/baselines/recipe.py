@@ -13,16 +13,55 @@ from sb3_skillgraph.agent import SkillGraphAgent
 from sb3_skillgraph.replay import as_rows
 
 
+class NewGoals(gym.Wrapper):
+    """
+    Gives a new goal where the agent stands: when it has reached one, and after so many steps at the latest.
+
+    :param env: a goal environment with ``sample_free(rng)`` and ``success_radius`` whose episodes go on at the goal
+    :param n_steps: for which a goal is pursued
+    """
+
+    def __init__(self, env: gym.Env, n_steps: int) -> None:
+        super().__init__(env)
+        self.n_steps = n_steps
+        self._goal = np.zeros(0)
+        self._steps = 0
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode with the wrapped environment's goal.
+
+        :param seed: seeds the wrapped environment
+        :param options: those of the wrapped environment
+        """
+        observation, info = self.env.reset(seed=seed, options=options)
+        self._goal, self._steps = observation["desired_goal"], 0
+        return observation, info
+
+    def step(self, action: np.ndarray) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """Take a step.
+
+        :param action: action of the wrapped environment
+        :return: observation, which holds the next goal, reward, terminated, truncated and info
+        """
+        observation, *rest = self.env.step(action)
+        self._steps += 1
+        distance = np.linalg.norm(observation["achieved_goal"] - self._goal)
+        if distance <= self.get_wrapper_attr("success_radius") or self._steps >= self.n_steps:
+            self._goal, self._steps = self.get_wrapper_attr("sample_free")(self.np_random), 0
+        return {**observation, "desired_goal": self._goal}, *rest  # type: ignore[return-value]
+
+
 class HindsightRecipe:
     """
-    The global option of a skill graph, learned by itself: TD3 or DDPG with hindsight, and a new goal every episode.
+    The global option of a skill graph, learned by itself: TD3 or DDPG with hindsight.
 
     It sees, is paid and learns from minibatches (no goal is put in shortly before a fall) as the options of a
-    :class:`~sb3_skillgraph.SkillGraphAgent` with the same arguments, under the same noise, and all of that agent's updates go
-    to it. Goals are the environment's, and there are no events, no plans and no ways remembered.
+    :class:`~sb3_skillgraph.SkillGraphAgent` with the same arguments, under the same noise, is shaken loose where it stands
+    still, and all of that agent's updates go to it. Goals are the environment's (with :class:`NewGoals`, new ones as soon as
+    one is reached), and there are no events, no plans and no ways remembered.
 
-    :param env: a goal environment whose episodes end at the goal, with ``info["is_success"]``: without it an end at the
-        goal counts as one for every other goal, too
+    :param env: a goal environment; where its episodes end at the goal, with ``info["is_success"]``: without it an end at
+        the goal counts as one for every other goal, too
     :param seed: of everything random
     :param kwargs: further arguments of :class:`~sb3_skillgraph.SkillGraphAgent`; those of the graph have no effect
     :raises ValueError: if updates are to follow episodes instead of steps
@@ -33,6 +72,7 @@ class HindsightRecipe:
         self.agent = SkillGraphAgent(**{"policy": "MultiInputPolicy", **kwargs}, env=env, seed=seed)
         self.agent.planning = False
         self.agent.set_logger(Logger(folder=None, output_formats=[]))
+        self._state: tuple[np.ndarray, ...] | None = None
         if self.agent.train_freq.unit != TrainFrequencyUnit.STEP:  # type: ignore[union-attr]
             raise ValueError(f"train_freq must be a number of steps, not {self.agent.train_freq}.")
 
@@ -47,30 +87,31 @@ class HindsightRecipe:
         every: int = agent.train_freq.frequency  # type: ignore[union-attr]
         n_updates = agent.gradient_steps if agent.gradient_steps >= 0 else every
         store.cut()
-        agent._hold_left[:] = 0
         observation, _ = self.env.reset(seed=agent.seed if store.total == 0 else None)
+        begins = True
         for _ in range(total_timesteps):
-            scaled = self._explore(observation)
+            scaled = self._explore(observation, begins)
             after, _, terminated, truncated, info = self.env.step(policy.unscale_action(scaled))
             stuck = bool(info.get("stuck"))
             over = terminated or truncated or stuck
             # An episode that ends at its own goal would have gone on for any other.
             ends = dict(terminated=terminated and not info.get("is_success"), done=over, stuck=stuck)
             store.add(**as_rows(observation, scaled, after), **{name: np.array([end]) for name, end in ends.items()})
-            observation = after
-            if over:
-                observation, _ = self.env.reset()
-                agent._hold_left[:] = 0
+            begins = over or not np.array_equal(observation["desired_goal"], after["desired_goal"])
+            observation = self.env.reset()[0] if over else after
             if store.total > agent.learning_starts and store.total % every == 0:
                 agent.train(n_updates, agent.batch_size)
             if on_step is not None:
                 on_step(store.total)
         return self
 
-    def _explore(self, observation: dict[str, np.ndarray]) -> np.ndarray:
+    def _explore(self, observation: dict[str, np.ndarray], begins: bool) -> np.ndarray:
         """Return an action in [-1, 1], shape ``(action_dim,)``: a random one at first, then the policy's with noise."""
         agent = self.agent
-        scaled = agent.global_option.learner.policy.scale_action(agent.predict(observation)[0])
+        if begins:  # the way to a goal
+            self._state, agent._hold_left[:] = None, 0
+        action, self._state = agent.predict(observation, self._state)
+        scaled = agent.global_option.learner.policy.scale_action(action)
         warm_up = agent.store.total < agent.learning_starts
         scaled = scaled.reshape(1, -1)
         explored, agent._held_actions, agent._hold_left = agent._explore(scaled, [warm_up], agent.action_noise)

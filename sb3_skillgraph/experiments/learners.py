@@ -15,7 +15,7 @@ from stable_baselines3 import DDPG, TD3
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_skillgraph.agent import SkillGraphAgent
-from sb3_skillgraph.baselines import CoveringOptions, HindsightRecipe, OptionTask, RandomWalk, make_her, make_uvfa
+from sb3_skillgraph.baselines import CoveringOptions, HindsightRecipe, NewGoals, OptionTask, RandomWalk, make_her, make_uvfa
 from sb3_skillgraph.evaluation import Predictor
 from sb3_skillgraph.hyperparams import check_hyperparams, did_you_mean, load_hyperparams
 from sb3_skillgraph.options.learner import OptionDDPG, OptionTD3
@@ -23,6 +23,7 @@ from sb3_skillgraph.plotting import event_links, near_links
 from sb3_skillgraph.run_folder import AGENT, load_agent, save_agent, stops
 
 Check = Callable[[int], None]
+GOAL_STEPS = 200  # for which the recipe pursues a goal, as long as an option may run
 _COVERING_CLASSES = {"OptionDDPG": OptionDDPG, "OptionTD3": OptionTD3}
 
 
@@ -275,7 +276,7 @@ class RecipeLearner(Learner):
     """The skill graph's global option, learned by itself."""
 
     def __init__(self, env_id: str, env_kwargs: dict[str, Any], seed: int, arguments: dict[str, Any]) -> None:
-        env = gym.make(env_id, **{"terminate_on_success": True, **env_kwargs})
+        env = NewGoals(gym.make(env_id, **env_kwargs), GOAL_STEPS)
         self.recipe = HindsightRecipe(env, seed=seed, **_recommended(env_id, arguments))
         self.policy: SkillGraphAgent = self.recipe.agent
 
