@@ -6,9 +6,10 @@ The agents are the checkpoints of ``sb3-skillgraph compare benchmarks/compare_an
 random goals at least 2 cells of path away, as ``evaluate_pairs`` draws them; the least distance from the goal in 1000 steps
 of 0.1 s tells whether it was reached within 0.45 m (the success radius), 0.6 m (the paper's) and 0.6 of a cell (2.4 m, about
 what DHRL asks for: 5 m in cells of 8 m). *Far goal*: from the training start to the free cell with the longest path, 32 times.
-An episode ends when the ant is on its back. *Straight*: the same pairs by the same agent without planning, its global option
-walking straight to the goal. *Cells*: share of the maze's free squares of 1 m that were visited in the last
-50 000 steps of training, and by a random walk in as many (its episodes end with a fall, too).
+*Floor*: from the training start to 100 goals anywhere on the floor, however near to a wall, where the body has no room.
+*Straight*: the random pairs by the same agent without planning, its global option walking straight to the goal. An episode
+ends when the ant is on its back. *Cells*: share of the maze's free squares of 1 m that were visited in the last 50 000 steps
+of training, and by a random walk in as many (its episodes end with a fall, too).
 """
 
 import argparse
@@ -25,28 +26,23 @@ import torch as th
 from sb3_skillgraph import SkillGraphAgent, __version__
 from sb3_skillgraph.baselines import RandomWalk
 from sb3_skillgraph.envs import MazeGeometry
-from sb3_skillgraph.evaluation import sample_pairs
+from sb3_skillgraph.evaluation import run_pair, sample_pairs
 from sb3_skillgraph.run_folder import CONFIG, checkpoints, load_agent
 
 TOLERANCES = {"0.45 m": 0.45, "0.6 m": 0.6, "0.6 cells": 2.4}
-WALKS = ("pairs", "far", "straight")
+WALKS = ("pairs", "far", "floor", "straight")
 N_PAIRS, N_FAR, N_LAST = 100, 32, 50_000
 
 
-def walk(agent: SkillGraphAgent, env: gym.Env, options: dict[str, Any]) -> dict[str, Any]:
-    """Go to one goal; tell how near the ant came, after how many steps, and whether it fell."""
-    observation, _ = env.reset(options=options)
-    goal, state = observation["desired_goal"], None
-    nearest = float(np.linalg.norm(observation["achieved_goal"] - goal))
-    steps, over, fell = 0, False, False
-    while not over:
-        action, state = agent.predict(observation, state=state, deterministic=True)
-        observation, _, terminated, truncated, info = env.step(action)
-        steps += 1
-        nearest = min(nearest, float(np.linalg.norm(observation["achieved_goal"] - goal)))
-        fell = bool(info.get("stuck"))
-        over = terminated or truncated or fell
-    return {"goal": goal.round(3).tolist(), "nearest": round(nearest, 4), "steps": steps, "fell": fell}
+def walk(agent: SkillGraphAgent, env: gym.Env, pairs: list[tuple[np.ndarray, np.ndarray]]) -> list[dict[str, Any]]:
+    """Go from starts to goals; tell how near the ant came, after how many steps, and whether it fell."""
+    walks = []
+    for start, goal in pairs:
+        pair = run_pair(agent, env, start, goal, np.nan)
+        walks.append(
+            {"goal": goal.round(3).tolist(), "nearest": round(pair.nearest, 4), "steps": pair.steps, "fell": pair.stuck}
+        )
+    return walks
 
 
 def farthest_cell(geometry: MazeGeometry) -> np.ndarray:
@@ -94,20 +90,20 @@ def test_run(folder: pathlib.Path) -> dict[str, Any]:
     agent = load_agent(saved[max(saved)], env)
     geometry, margin = env.get_wrapper_attr("geometry"), env.get_wrapper_attr("body_radius")
     env.reset(seed=config["seed"])
-    drawn = sample_pairs(geometry, margin, N_PAIRS, config["seed"] + 1000)
-    pairs = [walk(agent, env, {"start": start, "goal": goal}) for start, goal, _ in drawn]
-    goal = farthest_cell(geometry)
-    far = [walk(agent, env, {"goal": goal}) for _ in range(N_FAR)]
+    drawn = [pair[:2] for pair in sample_pairs(geometry, margin, N_PAIRS, config["seed"] + 1000)]
+    rng, home = np.random.default_rng(config["seed"]), geometry.cell_to_xy(*geometry.start_cell)
+    far = [(home + rng.uniform(-0.1, 0.1, 2), farthest_cell(geometry)) for _ in range(N_FAR)]
+    floor = [(home + rng.uniform(-0.1, 0.1, 2), geometry.sample_free(rng, 0.0)) for _ in range(N_PAIRS)]
+    walks = {kind: walk(agent, env, pairs) for kind, pairs in (("pairs", drawn), ("far", far), ("floor", floor))}
     last = np.arange(max(agent.store.oldest, agent.store.total - N_LAST), agent.store.total)
     agent.planning = False
-    straight = [walk(agent, env, {"start": start, "goal": goal}) for start, goal, _ in drawn]
+    walks["straight"] = walk(agent, env, drawn)
     visits = {
         "agent": visited_share(geometry, agent.store.column("next_achieved_goal", last)),
         "random walk": visited_share(
             geometry, random_walk(gym.make(config["env_id"], **config["env_kwargs"]), config["seed"])
         ),
     }
-    walks = dict(zip(WALKS, (pairs, far, straight), strict=True))
     summary = {kind: rates(walked) for kind, walked in walks.items()}
     return {"seed": config["seed"], "steps": max(saved), **summary, "cells": visits, "walks": walks}
 

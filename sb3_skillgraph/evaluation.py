@@ -36,6 +36,8 @@ class PairResult(NamedTuple):
     :param steps: environment steps until then, or until the end of the episode
     :param status: which of the paper's cases the goal was to the agent's graph; None for agents that do not plan
     :param trace: how the agent's options did on the way; None for agents without a skill graph
+    :param nearest: least distance from the goal on the way, in world units
+    :param stuck: whether the agent got stuck, as its environment tells in ``info["stuck"]``, which ends the episode
     """
 
     start: np.ndarray
@@ -45,6 +47,8 @@ class PairResult(NamedTuple):
     steps: int
     status: str | None
     trace: "SkillTrace | None" = None
+    nearest: float = np.inf
+    stuck: bool = False
 
 
 class CalibrationBin(NamedTuple):
@@ -227,7 +231,8 @@ def run_pair(agent: Predictor, env: gym.Env, start: np.ndarray, goal: np.ndarray
     watch = _Watch(agent, observation) if isinstance(agent, SkillGraphAgent) else None
     state: tuple[np.ndarray, ...] | None = None
     episode_start = np.ones(1, dtype=bool)
-    steps, over = 0, bool(info["is_success"])
+    steps, nearest = 0, _distance(observation)
+    stuck, over = False, bool(info["is_success"])
     while not over:
         if watch is not None:
             action, state = watch.act(observation, state)
@@ -236,11 +241,16 @@ def run_pair(agent: Predictor, env: gym.Env, start: np.ndarray, goal: np.ndarray
         episode_start = np.zeros(1, dtype=bool)
         observation, _, terminated, truncated, info = env.step(action)
         steps += 1
-        over = terminated or truncated
+        nearest = min(nearest, _distance(observation))
+        stuck = bool(info.get("stuck"))
+        over = terminated or truncated or stuck
     success = bool(info["is_success"])
-    if watch is None:
-        return PairResult(start, goal, cells, success, steps, None)
-    return PairResult(start, goal, cells, success, steps, watch.plan.status, watch.ended(success))
+    status, trace = (watch.plan.status, watch.ended(success)) if watch is not None else (None, None)
+    return PairResult(start, goal, cells, success, steps, status, trace, nearest, stuck)
+
+
+def _distance(observation: Any) -> float:
+    return float(np.linalg.norm(observation["achieved_goal"] - observation["desired_goal"]))
 
 
 class _Watch:

@@ -16,6 +16,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 from sb3_skillgraph import OptionEnv, OptionsEnv, SkillGraphAgent
 from sb3_skillgraph.baselines import CoveringOptions
 from sb3_skillgraph.controller import FAILED, GLOBAL, ControllerState, Request
+from sb3_skillgraph.evaluation import run_pair
 from sb3_skillgraph.events import SalientEvent
 
 PIT, DEPTH = np.array([0.0, 1.4]), 0.45  # beside the way from the toy maze's start
@@ -185,3 +186,18 @@ def test_options_env_ends_its_episode(trained: SkillGraphAgent) -> None:
         _, _, over, truncated, info = env.step(env.max_options - 5)  # along x
     assert info["stuck"]
     assert not truncated
+
+
+class Up:
+    """Walks up, into the pit if it begins below."""
+
+    def predict(self, observation: Any, *_: Any, **__: Any) -> tuple[np.ndarray, None]:
+        return np.array([0.0, 1.0], dtype=np.float32), None
+
+
+@pytest.mark.parametrize(("x", "stuck"), [(0.0, True), (-1.2, False)])
+def test_a_test_ends_where_the_agent_is_stuck(x: float, stuck: bool) -> None:
+    env = Pit(gym.make(TOY, terminate_on_success=True, max_steps=30))
+    pair = run_pair(Up(), env, np.array([x, 0.6]), np.array([1.0, -1.0]), np.nan)
+    assert (pair.success, pair.stuck, pair.steps < 30) == (False, stuck, stuck)
+    assert pair.nearest == pytest.approx(np.hypot(x - 1.0, 1.6))

@@ -194,6 +194,8 @@ class _Run:
                     "path_length": round(p.path_length, 3),
                     "success": bool(p.success),
                     "steps": p.steps,
+                    "nearest": round(p.nearest, 4),
+                    "stuck": p.stuck,
                 }
                 for p in result.pairs
             ],
