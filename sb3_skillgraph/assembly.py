@@ -44,7 +44,7 @@ class Assembly(Persistence):
         self.event_radius = self._event_radius()
         if not 0 < args["goal_tolerance"] <= 1:
             raise ValueError(f"goal_tolerance must lie in (0, 1], not {args['goal_tolerance']!r}: it is a share of a radius.")
-        self._view_name, function = find_view(args["option_view"], self.env)
+        self._view_name, function = find_view(args["option_view"], self.env, spec)
         self.view = ScaledView(function, self.event_radius)
         self.store = TransitionStore(
             self.buffer_size, spec.observation_dim, spec.goal_dim, spec.action_dim, n_envs=self.n_envs

@@ -7,7 +7,7 @@ import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
-from sb3_skillgraph.options.views import View, as_view
+from sb3_skillgraph.options.views import View, as_view, body_view, placed_body_view
 
 FLOAT32_MAX = float(np.finfo(np.float32).max)
 KEYS = ("observation", "achieved_goal", "desired_goal")
@@ -153,17 +153,27 @@ def env_attribute(env: VecEnv, name: str) -> Any:
     return env.get_attr(name, indices=0)[0] if env.has_attr(name) else None
 
 
-def find_view(view: str | View | None, env: VecEnv | None) -> tuple[str | None, View]:
+def find_view(view: str | View | None, env: VecEnv | None, spec: GoalSpec) -> tuple[str | None, View]:
     """Return what a policy is to see.
 
     :param view: name of a view, a function, or None for what the environment names (else ``"relative"``)
     :param env: the environment
+    :param spec: the environment's lengths
     :return: the name (None for a function) and the function
-    :raises ValueError: if there is no view of that name
+    :raises ValueError: if there is no view of that name, or it cannot be one of that environment
     """
     if view is None:
         view = (env_attribute(env, "option_view") if env is not None else None) or "relative"
-    return (None if callable(view) else view), as_view(view)
+    function = as_view(view)
+    n_joints = (spec.observation_dim - 11) // 2
+    if function in (body_view, placed_body_view) and n_joints > spec.action_dim:
+        raise ValueError(
+            f"option_view {view!r} would take an observation of {spec.observation_dim} numbers for a body with {n_joints} "
+            f"joints, but actions have {spec.action_dim}: there must be something else in it, such as contact forces "
+            "(gymnasium-robotics' ant leaves them out with include_cfrc_ext_in_observation=False). For a body with joints "
+            "that no motor moves give a function."
+        )
+    return (None if callable(view) else view), function
 
 
 class Oracle:
