@@ -19,7 +19,7 @@ from sb3_skillgraph.baselines import RandomWalk
 from sb3_skillgraph.console import UserError, assignment, for_people, positive
 from sb3_skillgraph.evaluation import PairsResult, evaluate_pairs
 from sb3_skillgraph.experiments.commands import add_compare, add_figure, add_status
-from sb3_skillgraph.hyperparams import check_hyperparams, did_you_mean, load_hyperparams
+from sb3_skillgraph.hyperparams import check_hyperparams, did_you_mean, load_entry, load_hyperparams
 from sb3_skillgraph.plotting import plot_plan, plot_skill_graph, run_plan, save_figure
 from sb3_skillgraph.run_folder import AGENT, checkpoints
 from sb3_skillgraph.training import train, write_json
@@ -98,6 +98,11 @@ def _add_train(commands: Any) -> None:
     command.add_argument("--device", default="auto", help="torch device: auto, cpu, cuda (default: auto)")
     command.add_argument("--verbose", action="store_true", help="print SB3's table as well as the progress bar")
     command.add_argument(
+        "--hyperparams-of",
+        metavar="ENV",
+        help="begin with the entry of another environment: SkillGraph/AntUMaze-v0 for an ant of your own",
+    )
+    command.add_argument(
         "--hyperparams",
         nargs="+",
         type=assignment,
@@ -166,9 +171,10 @@ def _train(args: argparse.Namespace) -> int:
         raise UserError(f"{out} holds an agent already; give another folder with --out, or remove it.")
     with for_people():
         given = check_hyperparams(dict(args.hyperparams), "--hyperparams")
-        hyperparams = {**load_hyperparams(args.env), **given}
-    recommended = int(hyperparams.pop("n_timesteps"))
-    env_kwargs, steps = dict(args.env_kwargs), args.steps or recommended
+        recommended = load_entry(args.hyperparams_of) if args.hyperparams_of else load_hyperparams(args.env)
+        hyperparams = {**recommended, **given}
+    n_timesteps = int(hyperparams.pop("n_timesteps"))
+    env_kwargs, steps = dict(args.env_kwargs), args.steps or n_timesteps
     train(args.env, env_kwargs, hyperparams, steps, args.seed, out, args.n_envs, args.device, args.verbose)
     return 0
 

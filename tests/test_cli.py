@@ -118,6 +118,8 @@ class TestTrain:
         assert steps == load_hyperparams("SkillGraph/AntUMaze-v0")["n_timesteps"]
         assert hyperparams["gamma"] == 0.9 and hyperparams["option_class"] is OptionTD3
         assert (seed, out) == (0, Path("runs/AntUMaze-v0-seed0"))
+        assert cli.main(["train", TOY, "--hyperparams-of", "SkillGraph/AntUMaze-v0", "--hyperparams", "gamma=0.9"]) == 0
+        assert calls[1][0] == TOY and calls[1][2:4] == (hyperparams, steps)
 
 
 class TestErrors:
@@ -129,6 +131,7 @@ class TestErrors:
             (["train", "no_such_package:Env-v0"], "no_such_package"),
             (["train", "CartPole-v1"], "goal environment"),
             (["train", TOY, "--hyperparams", "gama=0.9"], "did you mean 'gamma'"),
+            (["train", TOY, "--hyperparams-of", "SkillGraph/AntUMze-v0"], "did you mean 'SkillGraph/AntUMaze-v0'"),
             (["train", TOY, "--hyperparams", "gamma=high"], "gamma must be a number, not 'high'"),
             (["train", TOY, "--hyperparams", "salience=magic"], "Unknown salience 'magic'"),
             (["train", TOY, "--hyperparams", "option_class=PPO"], "OptionDDPG"),
@@ -213,7 +216,7 @@ class TestHyperparams:
         [
             ("Mine-v0: {learning_rat: 1}", "custom.yml, entry 'Mine-v0': unknown argument 'learning_rat'; did you mean"),
             ("Mine-v0: [1, 2]", "custom.yml, entry 'Mine-v0': a mapping"),
-            ("[1, 2]", "custom.yml, entry 'defaults': a mapping"),
+            ("[1, 2]", "custom.yml: a mapping"),
             ("Mine-v0: {", "custom.yml is no valid YAML"),
         ],
     )

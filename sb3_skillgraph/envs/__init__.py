@@ -7,6 +7,7 @@ import gymnasium as gym
 from sb3_skillgraph.envs.maze_geometry import LARGE_MAZE, MEDIUM_MAZE, OPEN_AREA, U_MAZE, MazeGeometry, MazeMap
 from sb3_skillgraph.envs.task import GoalTask
 from sb3_skillgraph.envs.toy import ToyMazeEnv
+from sb3_skillgraph.envs.wrappers import HoldAction, TellStuck, on_its_back
 
 __all__ = [
     "LARGE_MAZE",
@@ -14,9 +15,12 @@ __all__ = [
     "OPEN_AREA",
     "U_MAZE",
     "GoalTask",
+    "HoldAction",
     "MazeGeometry",
     "MazeMap",
+    "TellStuck",
     "ToyMazeEnv",
+    "on_its_back",
     "register",
 ]
 

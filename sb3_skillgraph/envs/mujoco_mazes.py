@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 
 from sb3_skillgraph.envs.maze_geometry import MazeGeometry, MazeMap
 from sb3_skillgraph.envs.task import GoalTask, Observation
+from sb3_skillgraph.envs.wrappers import UPRIGHT, upward
 
 # gymnasium-robotics prints a notice about its hand tasks to stderr when it is imported.
 with contextlib.redirect_stderr(io.StringIO()):
     from gymnasium_robotics.envs.maze import ant_maze_v5, point_maze
 
 _POINT_CELL_SIZE, _ANT_CELL_SIZE = 1.0, 4.0
-_UPRIGHT = 0.2  # upward component of the torso's axis below which it lies on its side or back
 _FULL_STATE = mujoco.mjtState.mjSTATE_INTEGRATION
 _temporary_directory_lock = threading.Lock()
 
@@ -195,7 +195,7 @@ class AntMazeEnv(MujocoMazeTask, ant_maze_v5.AntMazeEnv):
     def _make_info(self, success: bool) -> dict[str, Any]:
         _, x, y, _ = self.ant_env.data.qpos[3:7].tolist()
         info = super()._make_info(success)
-        fallen = 1.0 - 2.0 * (x * x + y * y) <= _UPRIGHT
+        fallen = upward(x, y) <= UPRIGHT
         return {**info, "stuck": True} if fallen and self.tell_stuck else info
 
 

@@ -57,8 +57,7 @@ class GoalTask(gym.Env[Any, NDArray[np.float32]]):
     environment class in the list of bases, which is why this class has no ``__init__``.
     """
 
-    #: What an option's policy sees by default: ``"egocentric"`` leaves out the absolute position with which the
-    #: observation begins, ``"relative"`` leaves nothing out; both see the goal relative to the body.
+    #: What an option's policy sees by default, see :mod:`sb3_skillgraph.options.views`.
     option_view: str
     #: Distance that sampled positions keep from walls, in world units.
     body_radius: float

@@ -28,17 +28,38 @@ def load_hyperparams(env_id: str, path: Path = FILE) -> dict[str, Any]:
     :return: ``n_timesteps`` and keyword arguments of :class:`~sb3_skillgraph.SkillGraphAgent`, ``policy`` among them
     :raises ValueError: if the file is no YAML of that layout, or names an unknown argument or option class
     """
-    try:
-        document = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
-    except yaml.YAMLError as error:
-        raise ValueError(f"{path.name} is no valid YAML: {' '.join(str(error).split())}") from error
+    document = _read(path)
     hyperparams: dict[str, Any] = {}
     for entry in ("defaults", env_id):
-        values = (document.get(entry) or {}) if isinstance(document, dict) else document
+        values = document.get(entry) or {}
         if not isinstance(values, dict):
             raise ValueError(f"{path.name}, entry {entry!r}: a mapping of argument names to values is wanted.")
         hyperparams.update(check_hyperparams(values, f"{path.name}, entry {entry!r}"))
     return hyperparams
+
+
+def load_entry(env_id: str, path: Path = FILE) -> dict[str, Any]:
+    """Read what is recommended for an environment that has an entry, for use with another one.
+
+    :param env_id: id of the environment
+    :param path: YAML file
+    :return: what :func:`load_hyperparams` returns
+    :raises ValueError: if the environment has no entry, and where :func:`load_hyperparams` raises it
+    """
+    entries = _read(path)
+    if env_id not in entries:
+        raise ValueError(f"{path.name} has no entry {env_id!r}{did_you_mean(env_id, entries)}.")
+    return load_hyperparams(env_id, path)
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        document = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
+    except yaml.YAMLError as error:
+        raise ValueError(f"{path.name} is no valid YAML: {' '.join(str(error).split())}") from error
+    if not isinstance(document, dict):
+        raise ValueError(f"{path.name}: a mapping of environments to arguments is wanted.")
+    return document
 
 
 def check_hyperparams(values: dict[str, Any], origin: str) -> dict[str, Any]:
