@@ -100,7 +100,7 @@ class SkillGraphAgent(Rollouts):
     :param practise_prob: probability that a mission goes to an event that a path leads to
     :param practise: which one: ``"least_tried"`` (whose last step on the path has run least often) or ``"random"``
     :param max_tries: timed-out options after which a mission is given up
-    :param max_failures: timed-out options in a row after which a chain is given up; None for never
+    :param max_failures: failed options in a row after which a chain is given up; None for never
     :param link_reach: a crossing between two events in at most so many steps opens a chain between them; 0 for never
     :param prune_after: episodes after which a chain is let go that no plan has used meanwhile; None for never
     :param off_policy_runs: whether any crossing between a chain's events counts for its gestating root

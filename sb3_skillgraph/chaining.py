@@ -25,7 +25,7 @@ class SkillChain:
     :param joins: whether it is the chain that joins a new event to the graph
     :param complete: whether one of its options can be started from the source event and has shown often enough that it
         reaches its target
-    :param n_failures: timed-out runs since the last success
+    :param n_failures: failed runs since the last success
     :param dropped: whether it has been given up as hopeless
     """
 
@@ -52,7 +52,7 @@ class DeepSkillChaining:
     :param on_maturity: called with an option the moment it matures (it then takes over the global policy)
     :param gestation_period: successes an option needs to mature
     :param practice_runs: successful runs of its own that an option needs before its chain is complete
-    :param max_failures: timed-out runs in a row after which a chain is given up; None for never
+    :param max_failures: failed runs in a row after which a chain is given up; None for never
     """
 
     def __init__(

@@ -22,8 +22,10 @@ from conftest import (
 from stable_baselines3 import SAC, TD3
 from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.vec_env import SubprocVecEnv
+from stable_baselines3.td3.policies import TD3Policy
 
 from sb3_skillgraph import PAPER, SkillGraphAgent
+from sb3_skillgraph.hyperparams import load_hyperparams
 
 GO_ON = """
 import sys
@@ -81,6 +83,21 @@ def test_new_process_ends_where_unbroken_learning_ends(tmp_path: Path) -> None:
 def test_new_process_on_a_simulator(tmp_path: Path) -> None:
     for agent in check_new_process(tmp_path, POINT, 451, max_steps=150):
         assert agent.options
+
+
+@pytest.mark.mujoco
+def test_an_ant_with_the_shipped_settings(tmp_path: Path) -> None:
+    settings = {**load_hyperparams("SkillGraph/AntUMaze-v0"), "learning_starts": 120, "batch_size": 32}
+    del settings["n_timesteps"]
+
+    def ant_env() -> gym.Env:
+        return gym.make("SkillGraph/AntUMaze-v0", max_steps=80)
+
+    whole = SkillGraphAgent(env=ant_env(), seed=0, **settings).learn(300)
+    assert whole.options and isinstance(whole.policy, TD3Policy)
+    expected = state_of(whole)
+    half = SkillGraphAgent(env=ant_env(), seed=0, **settings).learn(150)
+    check_equal(expected, state_of(go_on(half, 150, tmp_path, ant_env())))
 
 
 @pytest.mark.parametrize("n_steps", [1, 150, 263, 300])
