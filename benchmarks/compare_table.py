@@ -134,8 +134,10 @@ def main() -> None:
     write(args.out / f"{args.plan.stem}_summary.csv", rows)
     columns = ["Task", "Steps", "Method", "Mean", "IQM (95 %)", "Seeds' range", "Seeds", "Steps to goals reached"]
     print(table(columns, [*map(line, rows)]))
+    orders = args.out / f"{args.plan.stem}_order.csv"
+    orders.unlink(missing_ok=True)
     if compared:
-        write(args.out / f"{args.plan.stem}_order.csv", compared)
+        write(orders, compared)
         print()
         print(
             table(["Task", "Is better", "Difference of means (95 %)", "Seeds", "Told apart"], [*map(compared_line, compared)])

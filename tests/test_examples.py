@@ -1,0 +1,70 @@
+"""The examples run as they are, with fewer steps."""
+
+import runpy
+import sys
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+import pytest
+from conftest import TOY
+
+from sb3_skillgraph import SkillGraphAgent
+
+EXAMPLES = Path(__file__).parent.parent / "examples"
+
+
+def run(monkeypatch: pytest.MonkeyPatch, name: str, *arguments: object) -> None:
+    monkeypatch.setattr(sys, "argv", [name, *map(str, arguments)])
+    runpy.run_path(str(EXAMPLES / name), run_name="__main__")
+
+
+def test_quickstart(monkeypatch: Any, tmp_path: Path, capsys: Any) -> None:
+    run(monkeypatch, "quickstart.py", "--env", TOY, "--steps", 300, "--out", tmp_path / "new")
+    assert "the goal" in capsys.readouterr().out
+    assert {path.name for path in (tmp_path / "new").iterdir()} == {"agent.zip", "skill_graph.png", "plan.png"}
+
+
+def test_own_environment(monkeypatch: Any, capsys: Any) -> None:
+    run(monkeypatch, "own_environment.py", "--steps", 300)
+    assert "success rate: " in capsys.readouterr().out
+
+
+def test_options_env(monkeypatch: Any, capsys: Any) -> None:
+    run(monkeypatch, "options_env.py", "--env", TOY, "--steps", 400, "--decisions", 150)
+    assert capsys.readouterr().out
+
+
+class Darkness:
+    """Renders without a screen, and without OpenGL."""
+
+    n_frames = 0
+
+    def __init__(self, model: mujoco.MjModel, height: int, width: int) -> None:
+        self.shape = (height, width, 3)
+
+    def update_scene(self, data: mujoco.MjData, camera: mujoco.MjvCamera) -> None:
+        pass
+
+    def render(self) -> np.ndarray:
+        Darkness.n_frames += 1
+        return np.zeros(self.shape, dtype=np.uint8)
+
+
+@pytest.mark.mujoco
+def test_ant_to_any_goal(monkeypatch: Any, tmp_path: Path, capsys: Any) -> None:
+    monkeypatch.setattr(mujoco, "Renderer", Darkness)
+    agent = SkillGraphAgent("MultiInputPolicy", gym.make("SkillGraph/AntUMaze-v0"), seed=0)
+    agent.save(tmp_path / "agent.zip")
+    goals = ["--goal", "-3.9", "4.1", "--goal", "-4", "-4"]  # at the start, and far away
+    run(monkeypatch, "ant_to_any_goal.py", tmp_path / "agent.zip", *goals, "--out", tmp_path / "out")
+    out = capsys.readouterr().out
+    assert "goal [-3.9, 4.1]: " in out and "steps, reached" in out
+    assert "goal [-4.0, -4.0]: outside, " in out
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"way_0.png", "way_1.png", "ant.gif", "ant.png"}
+    assert Darkness.n_frames > 10
+    with pytest.raises(SystemExit):
+        run(monkeypatch, "ant_to_any_goal.py", tmp_path / "agent.zip", "--goal", 0, 0)
+    assert "reset option 'goal' is" in capsys.readouterr().err
