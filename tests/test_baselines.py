@@ -9,6 +9,7 @@ import pytest
 import torch as th
 from conftest import TOY
 from stable_baselines3 import DDPG, HerReplayBuffer
+from stable_baselines3.common.buffers import DictReplayBuffer
 
 from sb3_skillgraph import evaluate_pairs
 from sb3_skillgraph.baselines import (
@@ -285,6 +286,20 @@ def test_an_ants_primitive_action_is_a_step_of_a_global_option() -> None:
     twin = learner.copy(env)
     actions = [agent.predict(observation, deterministic=True)[0] for agent in (learner, twin)]
     np.testing.assert_array_equal(*actions)
+
+
+def test_covering_options_learn_on_from_where_the_environment_stands(covering: CoveringOptions) -> None:
+    twin = covering.copy(AnyStart(toy(maze_map=CORRIDOR)))
+    buffer, n_compared = twin.model.replay_buffer, 0
+    assert isinstance(buffer, DictReplayBuffer)
+    for _ in range(4):
+        stored, steps = buffer.pos, twin.store.total
+        twin.learn(40)
+        if buffer.pos > stored:  # the first decision of this learning, and its first step
+            begun = twin.store.column("achieved_goal", np.array([steps]))
+            np.testing.assert_allclose(buffer.observations["achieved_goal"][stored], begun, atol=1e-6)
+            n_compared += 1
+    assert n_compared >= 2
 
 
 def test_learning_on_begins_a_new_trajectory() -> None:

@@ -217,7 +217,8 @@ class CoveringOptions:
         :return: itself
         """
         self._on_step = on_step
-        self.store.cut()  # the environment is reset
+        self.model._last_obs = None  # SB3 forgets the last step when it is told to stop; so the environment is reset
+        self.store.cut()
         episodes = total_timesteps // int(self.env.get_wrapper_attr("max_steps"))
         self._next_option = self.option_freq = max(1, min(self.option_freq, episodes // (2 * self.n_options)))
         self.model.budget.start, self.model.budget.total = self.num_timesteps, total_timesteps
