@@ -17,6 +17,7 @@ import json
 import pathlib
 import shlex
 import sys
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -34,8 +35,8 @@ WALKS = ("pairs", "far", "floor", "straight")
 N_PAIRS, N_FAR, N_LAST = 100, 32, 50_000
 
 
-def walk(agent: SkillGraphAgent, env: gym.Env, pairs: list[tuple[np.ndarray, np.ndarray]]) -> list[dict[str, Any]]:
-    """Go from starts to goals; tell how near the ant came, after how many steps, and whether it fell."""
+def walk(agent: SkillGraphAgent, env: gym.Env, pairs: Sequence[tuple[np.ndarray | None, np.ndarray]]) -> list[dict[str, Any]]:
+    """Go from starts (None: the training start) to goals; how near the ant came, after how many steps, whether it fell."""
     walks = []
     for start, goal in pairs:
         pair = run_pair(agent, env, start, goal, np.nan)
@@ -91,9 +92,9 @@ def test_run(folder: pathlib.Path) -> dict[str, Any]:
     geometry, margin = env.get_wrapper_attr("geometry"), env.get_wrapper_attr("body_radius")
     env.reset(seed=config["seed"])
     drawn = [pair[:2] for pair in sample_pairs(geometry, margin, N_PAIRS, config["seed"] + 1000)]
-    rng, home = np.random.default_rng(config["seed"]), geometry.cell_to_xy(*geometry.start_cell)
-    far = [(home + rng.uniform(-0.1, 0.1, 2), farthest_cell(geometry)) for _ in range(N_FAR)]
-    floor = [(home + rng.uniform(-0.1, 0.1, 2), geometry.sample_free(rng, 0.0)) for _ in range(N_PAIRS)]
+    rng = np.random.default_rng(config["seed"])
+    far = [(None, farthest_cell(geometry))] * N_FAR
+    floor = [(None, geometry.sample_free(rng, 0.0)) for _ in range(N_PAIRS)]
     walks = {kind: walk(agent, env, pairs) for kind, pairs in (("pairs", drawn), ("far", far), ("floor", floor))}
     last = np.arange(max(agent.store.oldest, agent.store.total - N_LAST), agent.store.total)
     agent.planning = False

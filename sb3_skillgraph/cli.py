@@ -19,7 +19,7 @@ from sb3_skillgraph.baselines import RandomWalk
 from sb3_skillgraph.console import UserError, assignment, for_people, positive
 from sb3_skillgraph.evaluation import PairsResult, evaluate_pairs
 from sb3_skillgraph.experiments.commands import add_compare, add_figure, add_status
-from sb3_skillgraph.hyperparams import check_hyperparams, did_you_mean, load_entry, load_hyperparams
+from sb3_skillgraph.hyperparams import check_hyperparams, did_you_mean, load_hyperparams
 from sb3_skillgraph.plotting import plot_plan, plot_skill_graph, run_plan, save_figure
 from sb3_skillgraph.run_folder import AGENT, checkpoints
 from sb3_skillgraph.training import train, write_json
@@ -171,7 +171,7 @@ def _train(args: argparse.Namespace) -> int:
         raise UserError(f"{out} holds an agent already; give another folder with --out, or remove it.")
     with for_people():
         given = check_hyperparams(dict(args.hyperparams), "--hyperparams")
-        recommended = load_entry(args.hyperparams_of) if args.hyperparams_of else load_hyperparams(args.env)
+        recommended = load_hyperparams(args.hyperparams_of or args.env, required=bool(args.hyperparams_of))
         hyperparams = {**recommended, **given}
     n_timesteps = int(hyperparams.pop("n_timesteps"))
     env_kwargs, steps = dict(args.env_kwargs), args.steps or n_timesteps

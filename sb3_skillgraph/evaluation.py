@@ -217,17 +217,18 @@ def evaluate_pairs(
         env.close()
 
 
-def run_pair(agent: Predictor, env: gym.Env, start: np.ndarray, goal: np.ndarray, cells: float) -> PairResult:
+def run_pair(agent: Predictor, env: gym.Env, start: np.ndarray | None, goal: np.ndarray, cells: float) -> PairResult:
     """Let an agent go from a start to a goal.
 
     :param agent: anything with SB3's ``predict``
     :param env: a ``SkillGraph/*`` environment that ends its episode on success
-    :param start: shape ``(goal_dim,)``
+    :param start: shape ``(goal_dim,)``; None for where the environment puts the agent
     :param goal: shape ``(goal_dim,)``
     :param cells: length of the shortest free path, in cells
     :return: what became of it
     """
     observation, info = env.reset(options={"start": start, "goal": goal})
+    start = observation["achieved_goal"] if start is None else start
     watch = _Watch(agent, observation) if isinstance(agent, SkillGraphAgent) else None
     state: tuple[np.ndarray, ...] | None = None
     episode_start = np.ones(1, dtype=bool)

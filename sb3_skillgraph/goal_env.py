@@ -7,7 +7,7 @@ import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
-from sb3_skillgraph.options.views import View, as_view, body_view, placed_body_view
+from sb3_skillgraph.options.views import BODY_NUMBERS, View, as_view, body_view, placed_body_view
 
 FLOAT32_MAX = float(np.finfo(np.float32).max)
 KEYS = ("observation", "achieved_goal", "desired_goal")
@@ -165,7 +165,7 @@ def find_view(view: str | View | None, env: VecEnv | None, spec: GoalSpec) -> tu
     if view is None:
         view = (env_attribute(env, "option_view") if env is not None else None) or "relative"
     function = as_view(view)
-    n_joints = (spec.observation_dim - 11) // 2
+    n_joints = (spec.observation_dim - BODY_NUMBERS) // 2
     if function in (body_view, placed_body_view) and n_joints > spec.action_dim:
         raise ValueError(
             f"option_view {view!r} would take an observation of {spec.observation_dim} numbers for a body with {n_joints} "

@@ -24,6 +24,7 @@ class NewGoals(gym.Wrapper):
     def __init__(self, env: gym.Env, n_steps: int) -> None:
         super().__init__(env)
         self.n_steps = n_steps
+        self._radius = float(env.get_wrapper_attr("success_radius"))
         self._goal = np.zeros(0)
         self._steps = 0
 
@@ -46,7 +47,7 @@ class NewGoals(gym.Wrapper):
         observation, *rest = self.env.step(action)
         self._steps += 1
         distance = np.linalg.norm(observation["achieved_goal"] - self._goal)
-        if distance <= self.get_wrapper_attr("success_radius") or self._steps >= self.n_steps:
+        if distance <= self._radius or self._steps >= self.n_steps:
             self._goal, self._steps = self.get_wrapper_attr("sample_free")(self.np_random), 0
         return {**observation, "desired_goal": self._goal}, *rest  # type: ignore[return-value]
 

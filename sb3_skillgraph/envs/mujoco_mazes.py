@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from sb3_skillgraph.envs.maze_geometry import MazeGeometry, MazeMap
 from sb3_skillgraph.envs.task import GoalTask, Observation
-from sb3_skillgraph.envs.wrappers import UPRIGHT, upward
+from sb3_skillgraph.envs.wrappers import lies_down
 
 # gymnasium-robotics prints a notice about its hand tasks to stderr when it is imported.
 with contextlib.redirect_stderr(io.StringIO()):
@@ -193,9 +193,8 @@ class AntMazeEnv(MujocoMazeTask, ant_maze_v5.AntMazeEnv):
         return self._get_obs(self.ant_env._get_obs())
 
     def _make_info(self, success: bool) -> dict[str, Any]:
-        _, x, y, _ = self.ant_env.data.qpos[3:7].tolist()
         info = super()._make_info(success)
-        fallen = upward(x, y) <= UPRIGHT
+        fallen = lies_down(self.ant_env.data.qpos[3:7])
         return {**info, "stuck": True} if fallen and self.tell_stuck else info
 
 

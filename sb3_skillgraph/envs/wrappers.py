@@ -6,7 +6,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-UPRIGHT = 0.2  # upward component of the torso's axis below which it lies on its side or back
+_UPRIGHT = 0.2  # upward component of the torso's axis below which it lies on its side or back
 
 
 class HoldAction(gym.Wrapper):
@@ -66,14 +66,13 @@ def on_its_back(observation: dict[str, np.ndarray]) -> bool:
 
     :param observation: its ``observation`` begins with height and quaternion, as Gymnasium's ant's
     """
-    _, x, y, _ = observation["observation"][1:5].tolist()
-    return upward(x, y) <= UPRIGHT
+    return lies_down(observation["observation"][1:5])
 
 
-def upward(x: float, y: float) -> float:
-    """Return the upward component of a body's vertical axis, 1 where it stands upright and -1 upside down.
+def lies_down(quaternion: np.ndarray) -> bool:
+    """Tell whether a body lies on its side or back.
 
-    :param x: of the body's quaternion (w, x, y, z)
-    :param y: of the same
+    :param quaternion: its orientation (w, x, y, z)
     """
-    return 1.0 - 2.0 * (x * x + y * y)
+    _, x, y, _ = quaternion.tolist()
+    return 1.0 - 2.0 * (x * x + y * y) <= _UPRIGHT

@@ -20,15 +20,24 @@ _PARAMETERS = inspect.signature(SkillGraphAgent.__init__).parameters
 _KNOWN = ({"n_timesteps"} | set(_PARAMETERS)) - {"self", "env", "seed", "_init_setup_model"}
 
 
-def load_hyperparams(env_id: str, path: Path = FILE) -> dict[str, Any]:
+def load_hyperparams(env_id: str, path: Path = FILE, *, required: bool = False) -> dict[str, Any]:
     """Read what is recommended for an environment.
 
     :param env_id: id of the environment; one without an entry gets the file's ``defaults``
     :param path: YAML file
+    :param required: whether there must be an entry, as where its values are for use with another environment
     :return: ``n_timesteps`` and keyword arguments of :class:`~sb3_skillgraph.SkillGraphAgent`, ``policy`` among them
-    :raises ValueError: if the file is no YAML of that layout, or names an unknown argument or option class
+    :raises ValueError: if the file is no YAML of that layout, names an unknown argument or option class, or has no entry
+        that is required
     """
-    document = _read(path)
+    try:
+        document = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
+    except yaml.YAMLError as error:
+        raise ValueError(f"{path.name} is no valid YAML: {' '.join(str(error).split())}") from error
+    if not isinstance(document, dict):
+        raise ValueError(f"{path.name}: a mapping of environments to arguments is wanted.")
+    if required and env_id not in document:
+        raise ValueError(f"{path.name} has no entry {env_id!r}{did_you_mean(env_id, document)}.")
     hyperparams: dict[str, Any] = {}
     for entry in ("defaults", env_id):
         values = document.get(entry) or {}
@@ -36,30 +45,6 @@ def load_hyperparams(env_id: str, path: Path = FILE) -> dict[str, Any]:
             raise ValueError(f"{path.name}, entry {entry!r}: a mapping of argument names to values is wanted.")
         hyperparams.update(check_hyperparams(values, f"{path.name}, entry {entry!r}"))
     return hyperparams
-
-
-def load_entry(env_id: str, path: Path = FILE) -> dict[str, Any]:
-    """Read what is recommended for an environment that has an entry, for use with another one.
-
-    :param env_id: id of the environment
-    :param path: YAML file
-    :return: what :func:`load_hyperparams` returns
-    :raises ValueError: if the environment has no entry, and where :func:`load_hyperparams` raises it
-    """
-    entries = _read(path)
-    if env_id not in entries:
-        raise ValueError(f"{path.name} has no entry {env_id!r}{did_you_mean(env_id, entries)}.")
-    return load_hyperparams(env_id, path)
-
-
-def _read(path: Path) -> dict[str, Any]:
-    try:
-        document = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
-    except yaml.YAMLError as error:
-        raise ValueError(f"{path.name} is no valid YAML: {' '.join(str(error).split())}") from error
-    if not isinstance(document, dict):
-        raise ValueError(f"{path.name}: a mapping of environments to arguments is wanted.")
-    return document
 
 
 def check_hyperparams(values: dict[str, Any], origin: str) -> dict[str, Any]:

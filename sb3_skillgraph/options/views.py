@@ -6,6 +6,7 @@ import numpy as np
 
 View = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
+BODY_NUMBERS = 11  # of what the body views take, beside two for each joint: height, quaternion, velocities
 DISTANCE_UNIT = 0.2  # scale of the body views' distances, which are otherwise up to tens of event radii
 
 
@@ -68,7 +69,7 @@ def placed_body_view(observation: np.ndarray, achieved_goal: np.ndarray, goal: n
 
 def _seen_from_body(observation: np.ndarray, achieved_goal: np.ndarray, goal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return what :func:`body_view` returns, and the direction on the floor that the body faces, shape ``(m, 2)``."""
-    n_joints, odd = divmod(observation.shape[1] - 11, 2)
+    n_joints, odd = divmod(observation.shape[1] - BODY_NUMBERS, 2)
     if odd or n_joints < 0 or goal.shape[1] != 2:
         raise ValueError(
             "The body views are for free bodies of MuJoCo: goals are positions (x, y), the observation is height, "
