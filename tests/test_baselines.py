@@ -288,6 +288,16 @@ def test_an_ants_primitive_action_is_a_step_of_a_global_option() -> None:
     np.testing.assert_array_equal(*actions)
 
 
+def test_a_global_option_takes_half_of_the_updates_of_covering_options() -> None:
+    env = gym.make("SkillGraph/AntUMaze-v0", terminate_on_success=True)
+    learner = CoveringOptions(env, n_options=3, seed=0)
+    assert learner._next_learner(0) is learner._next_learner(1) is learner.global_option
+    learner.options.extend(learner._option(f"c{i}", learner.env, 1.0) for i in range(3))  # type: ignore[arg-type]
+    took = [learner._next_learner(turn) for turn in range(60)]
+    assert took.count(learner.global_option) == 30
+    assert [took.count(option) for option in learner.options] == [10, 10, 10]
+
+
 def test_covering_options_learn_on_from_where_the_environment_stands(covering: CoveringOptions) -> None:
     twin = covering.copy(AnyStart(toy(maze_map=CORRIDOR)))
     buffer, n_compared = twin.model.replay_buffer, 0

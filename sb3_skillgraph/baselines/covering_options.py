@@ -132,7 +132,7 @@ class CoveringOptions:
     :param seed: of everything random
 
     Where actions have more than two dimensions a primitive action is one step of a global option (section 4), which learns
-    from all experience in hindsight; it can be run to the goal as well.
+    from all experience in hindsight, with half of the gradient steps; it can be run to the goal as well.
     """
 
     def __init__(
@@ -285,15 +285,23 @@ class CoveringOptions:
         self.store.add(**transition, **ends)
         self.num_timesteps += 1
         if self.num_timesteps % self.train_freq == 0 and len(self.store) >= self.batch_size:
-            learners = [option.learner for option in (*self.options, self.global_option) if option is not None]
-            if learners:
-                learners[self.num_timesteps // self.train_freq % len(learners)].train(self.gradient_steps, self.batch_size)
+            option = self._next_learner(self.num_timesteps // self.train_freq)
+            if option is not None:
+                option.learner.train(self.gradient_steps, self.batch_size)
         self._n_episodes += done
         if done and self._n_episodes >= self._next_option and len(self.options) < self.n_options:
             self._next_option = self._n_episodes + self.option_freq
             self.options.append(self._make_option())
         if self._on_step is not None:
             self._on_step(self.num_timesteps)
+
+    def _next_learner(self, turn: int) -> Option | None:
+        """Take turns; a global option takes every other one, as much as a skill graph's has at the least."""
+        if self.global_option is not None:
+            turn, rest = divmod(turn, 2)
+            if rest or not self.options:
+                return self.global_option
+        return self.options[turn % len(self.options)] if self.options else None
 
     def _make_option(self) -> Option:
         if len(self.options) % 2:
