@@ -3,6 +3,7 @@
 import argparse
 import sys
 from collections.abc import Sequence
+from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NoReturn
@@ -17,11 +18,11 @@ import sb3_skillgraph.envs  # noqa: F401 - registers the environments
 from sb3_skillgraph.agent import SkillGraphAgent
 from sb3_skillgraph.baselines import RandomWalk
 from sb3_skillgraph.console import UserError, assignment, for_people, positive
-from sb3_skillgraph.evaluation import PairsResult, evaluate_pairs
+from sb3_skillgraph.evaluation import NoPairsError, PairsResult, evaluate_pairs
 from sb3_skillgraph.experiments.commands import add_compare, add_figure, add_status
 from sb3_skillgraph.hyperparams import check_hyperparams, did_you_mean, load_hyperparams
 from sb3_skillgraph.plotting import plot_plan, plot_skill_graph, run_plan, save_figure
-from sb3_skillgraph.run_folder import AGENT, checkpoints
+from sb3_skillgraph.run_folder import AGENT, is_unfinished
 from sb3_skillgraph.training import train, write_json
 
 DEMO_ENV, DEMO_STEPS, DEMO_PAIRS = "SkillGraph/PointMazeMedium-v0", 100_000, 100
@@ -100,7 +101,8 @@ def _add_train(commands: Any) -> None:
     command.add_argument(
         "--hyperparams-of",
         metavar="ENV",
-        help="begin with the entry of another environment: SkillGraph/AntUMaze-v0 for an ant of your own",
+        help="begin with the entry of another environment: SkillGraph/AntUMaze-v0 for an ant of your own (which may need "
+        "event_radius and option_view in --hyperparams, too)",
     )
     command.add_argument(
         "--hyperparams",
@@ -167,9 +169,9 @@ def _add_demo(commands: Any) -> None:
 def _train(args: argparse.Namespace) -> int:
     _check_env_id(args.env)
     out = args.out or Path("runs") / f"{args.env.rpartition('/')[2]}-seed{args.seed}"
-    if (out / AGENT).exists() and not checkpoints(out):
-        raise UserError(f"{out} holds an agent already; give another folder with --out, or remove it.")
     with for_people():
+        if (out / AGENT).exists() and not is_unfinished(out):
+            raise UserError(f"{out} holds an agent already; give another folder with --out, or remove it.")
         given = check_hyperparams(dict(args.hyperparams), "--hyperparams")
         recommended = load_hyperparams(args.hyperparams_of or args.env, required=bool(args.hyperparams_of))
         hyperparams = {**recommended, **given}
@@ -190,6 +192,8 @@ def _evaluate(args: argparse.Namespace) -> int:
         result = evaluate_pairs(
             agent, args.env, env_kwargs=env_kwargs, n_pairs=args.pairs, seed=args.seed, adapt_timesteps=args.adapt
         )
+    except NoPairsError as error:
+        raise UserError(str(error)) from error
     finally:
         env.close()
     _print_table(args.env, {str(args.agent): result})
@@ -295,7 +299,15 @@ def _as_plain(result: PairsResult) -> dict[str, Any]:
         "success_rate": result.success_rate,
         "interval": result.interval,
         "mean_steps": _mean_steps(result),
-        "pairs": [{**pair._asdict(), "start": pair.start.tolist(), "goal": pair.goal.tolist()} for pair in result.pairs],
+        "pairs": [
+            {
+                **pair._asdict(),
+                "start": pair.start.tolist(),
+                "goal": pair.goal.tolist(),
+                "trace": None if pair.trace is None else asdict(pair.trace),
+            }
+            for pair in result.pairs
+        ],
     }
 
 

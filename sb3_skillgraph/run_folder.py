@@ -1,6 +1,7 @@
 """What a run keeps in its folder: checkpoints, from which it goes on exactly, and its log."""
 
 import csv
+import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -10,6 +11,7 @@ import torch as th
 from stable_baselines3.common.type_aliases import GymEnv
 
 from sb3_skillgraph.agent import SkillGraphAgent
+from sb3_skillgraph.saving import load_tree
 
 AGENT, CONFIG, PROGRESS = "agent.zip", "config.json", "progress.csv"
 STEPS = "time/total_timesteps"
@@ -23,6 +25,18 @@ def checkpoints(folder: Path) -> dict[int, Path]:
     """
     found = (path for path in folder.glob("checkpoint_*") if path.is_dir())
     return {int(path.name.partition("_")[2]): path for path in found}
+
+
+def is_unfinished(folder: Path) -> bool:
+    """Tell whether a folder holds a run that was broken off: it has a checkpoint or, before there was one, too few steps.
+
+    :param folder: of the run
+    :raises ValueError: if its agent is damaged
+    """
+    if checkpoints(folder) or not ((folder / AGENT).exists() and (folder / CONFIG).exists()):
+        return bool(checkpoints(folder))
+    n_steps: int = load_tree(folder / AGENT, "agent")["progress"]["counters"]["num_timesteps"]
+    return n_steps < int(json.loads((folder / CONFIG).read_text())["steps"])
 
 
 def stops(begin: int, end: int, every: int) -> list[int]:

@@ -18,6 +18,7 @@ from sb3_skillgraph.run_folder import (
     PROGRESS,
     STEPS,
     checkpoints,
+    is_unfinished,
     load_agent,
     read_progress,
     save_agent,
@@ -41,6 +42,8 @@ def train(
 ) -> SkillGraphAgent:
     """Train an agent, from the last checkpoint in the folder if there is one; that comes to the same as in one go.
 
+    A run that was broken off before its first checkpoint begins anew.
+
     :param env_id: id of the environment
     :param env_kwargs: its keyword arguments
     :param arguments: of :class:`~sb3_skillgraph.SkillGraphAgent`
@@ -56,7 +59,7 @@ def train(
     """
     config = dict(env=env_id, env_kwargs=env_kwargs, steps=steps, seed=seed, n_envs=n_envs, arguments=arguments)
     saved = checkpoints(out)
-    if saved:
+    if is_unfinished(out):
         _check_config(out, config)
     with for_people():
         env = make_vec_env(env_id, n_envs=n_envs, env_kwargs=env_kwargs)
@@ -86,10 +89,11 @@ def _learn(agent: SkillGraphAgent, steps: int, out: Path) -> None:
     finally:
         bar.close()
         agent.logger.close()
-        agent.save(out / AGENT)
-        print(f"{agent.num_timesteps} steps; the agent is in {out / AGENT}, its log in {out / PROGRESS}")
-        if agent.num_timesteps < steps and checkpoints(out):
-            print(f"the same command goes on after {max(checkpoints(out))} steps")
+        if agent.num_timesteps > 0:
+            agent.save(out / AGENT)
+            print(f"{agent.num_timesteps} steps; the agent is in {out / AGENT}, its log in {out / PROGRESS}")
+        if agent.num_timesteps < steps:
+            print(f"the same command goes on after {max(checkpoints(out), default=0)} steps")
     for path in checkpoints(out).values():
         shutil.rmtree(path)
 
@@ -129,4 +133,4 @@ def write_json(path: Path, document: dict[str, Any]) -> None:
 
 
 def _as_json(document: dict[str, Any]) -> str:
-    return json.dumps(document, indent=2, default=lambda item: getattr(item, "__name__", str(item)))
+    return json.dumps(document, indent=2, default=lambda item: item.__name__)

@@ -109,6 +109,37 @@ class TestTrain:
         assert differences(without_clock(state_of(a)), without_clock(state_of(b))) == []
         assert "holds an agent already" in error_line(capsys, [*command, str(broken)])
 
+    def test_a_run_broken_off_before_its_first_checkpoint_begins_anew(self, tmp_path, capsys, monkeypatch):
+        def interrupt(self):
+            if self.num_timesteps == 120:
+                raise KeyboardInterrupt
+            return True
+
+        alone, broken = tmp_path / "alone", tmp_path / "broken"
+        command = ["train", TOY, "--steps", "300", "--hyperparams", "learning_starts=100", "--out"]
+        assert cli.main([*command, str(alone)]) == 0
+        with monkeypatch.context() as patch:
+            patch.setattr(SkillGraphProgressBarCallback, "_on_step", interrupt)
+            assert cli.main([*command, str(broken)]) == 130
+        assert "the same command goes on after 0 steps" in capsys.readouterr().out
+        assert SkillGraphAgent.load(broken / "agent.zip").num_timesteps == 120
+        assert "unfinished run with other settings" in error_line(capsys, [*command, str(broken), "--seed", "1"])
+        assert cli.main([*command, str(broken)]) == 0
+        a, b = (SkillGraphAgent.load(out / "agent.zip") for out in (alone, broken))
+        assert differences(without_clock(state_of(a)), without_clock(state_of(b))) == []
+        assert "holds an agent already" in error_line(capsys, [*command, str(broken)])
+
+    def test_what_fails_at_its_first_step_does_not_block_the_folder(self, tmp_path, monkeypatch):
+        def fail(self):
+            raise RuntimeError("at the first step")
+
+        command = ["train", TOY, "--steps", "50", "--out", str(tmp_path)]
+        with monkeypatch.context() as patch:
+            patch.setattr(SkillGraphProgressBarCallback, "_on_training_start", fail)
+            with pytest.raises(RuntimeError, match="first step"):
+                cli.main(command)
+        assert cli.main([*command, "--seed", "1"]) == 0
+
     def test_takes_steps_from_yaml_and_names_the_folder(self, tmp_path, monkeypatch):
         calls = []
         monkeypatch.setattr(cli, "train", lambda *args: calls.append(args))
@@ -160,6 +191,10 @@ class TestErrors:
         argv = ["evaluate", str(trained / "agent.zip"), "--env", "SkillGraph/PointMazeUMaze-v0"]
         assert "spaces do not match" in error_line(capsys, argv)
 
+    def test_maze_without_room_for_pairs(self, trained, capsys):
+        argv = ["evaluate", str(trained / "agent.zip"), "--env", TOY, "--env-kwargs", "maze_map=[[1,1,1],[1,0,1],[1,1,1]]"]
+        assert "too small" in error_line(capsys, argv)
+
 
 class TestEvaluateAndPlot:
     def test_evaluate_writes_every_pair(self, trained, tmp_path, capsys):
@@ -169,6 +204,7 @@ class TestEvaluateAndPlot:
         result = json.loads(out.read_text())
         assert len(result["pairs"]) == 4
         assert result["success_rate"] == sum(pair["success"] for pair in result["pairs"]) / 4
+        assert all(pair["trace"]["n_successes"] <= pair["trace"]["n_runs"] for pair in result["pairs"])
         assert "95 % interval" in capsys.readouterr().out
 
     def test_adapt_and_no_planning(self, trained):
