@@ -91,14 +91,14 @@ class OptionOutcome(NamedTuple):
     :param env: which environment
     :param option: index of the option
     :param aim: where the global option walked to (see :class:`ControllerState`)
-    :param success: whether it reached its termination set; None if it was cut short
+    :param success: whether it reached its termination set
     :param steps: environment steps it ran
     """
 
     env: int
     option: int
     aim: int
-    success: bool | None
+    success: bool
     steps: int
 
 

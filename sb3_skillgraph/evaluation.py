@@ -26,6 +26,10 @@ class Predictor(Protocol):
         """Return actions and the state to pass back in."""
 
 
+class NoPairsError(ValueError):
+    """There is nothing to draw pairs of start and goal from."""
+
+
 class PairResult(NamedTuple):
     """What became of one pair.
 
@@ -88,7 +92,7 @@ class SkillTrace:
         for outcome in outcomes:
             if outcome.option != GLOBAL:
                 self.n_runs += 1
-                self.n_successes += bool(outcome.success)
+                self.n_successes += outcome.success
                 if self.followed is None and not outcome.success:
                     self.followed = False
 
@@ -157,7 +161,7 @@ def sample_pairs(
     :param seed: seed
     :param min_cells: shortest path at least, in cells
     :return: start, goal, and path length in cells
-    :raises ValueError: if no such pairs are found, the maze being too small
+    :raises NoPairsError: if no such pairs are found, the maze being too small
     """
     rng = np.random.default_rng(seed)
     pairs: list[tuple[np.ndarray, np.ndarray, float]] = []
@@ -170,7 +174,7 @@ def sample_pairs(
             pairs.append((start, goal, cells))
     if len(pairs) == n_pairs:
         return pairs
-    raise ValueError(f"The maze is too small: no {n_pairs} pairs of points {min_cells} cells apart were found.")
+    raise NoPairsError(f"The maze is too small: no {n_pairs} pairs of points {min_cells} cells apart were found.")
 
 
 def evaluate_pairs(
@@ -195,10 +199,10 @@ def evaluate_pairs(
     :param seed: seed of the pairs, and of the environment
     :param adapt_timesteps: environment steps that a copy of the agent learns with each goal before it is tested
     :return: success rate, interval and every pair
-    :raises ValueError: if the environment has no maze geometry to draw pairs from
+    :raises NoPairsError: if the environment has no maze geometry to draw pairs from, or one that is too small
     """
     if not env_id.startswith("SkillGraph/"):
-        raise ValueError(f"evaluate_pairs draws its pairs from a maze: it needs a SkillGraph/* environment, not {env_id!r}.")
+        raise NoPairsError(f"Pairs are drawn from the walls of a maze: that needs a SkillGraph/* environment, not {env_id!r}.")
     env = gym.make(env_id, **{"terminate_on_success": True, **(env_kwargs or {})})
     try:
         drawn = sample_pairs(env.get_wrapper_attr("geometry"), env.get_wrapper_attr("body_radius"), n_pairs, seed)
@@ -246,7 +250,7 @@ def run_pair(agent: Predictor, env: gym.Env, start: np.ndarray | None, goal: np.
         stuck = bool(info.get("stuck"))
         over = terminated or truncated or stuck
     success = bool(info["is_success"])
-    status, trace = (watch.plan.status, watch.ended(success)) if watch is not None else (None, None)
+    status, trace = (watch.plan.status, watch.ended(success, stuck)) if watch is not None else (None, None)
     return PairResult(start, goal, cells, success, steps, status, trace, nearest, stuck)
 
 
@@ -263,16 +267,19 @@ class _Watch:
         runs_options = agent.planning and any(vertex in agent.graph.options for vertex in self.plan.path)
         self.trace = SkillTrace(self.plan.success_probability if runs_options else None)
         self.end = agent.graph.events[self.plan.path[-1]] if self.plan.path else None
+        self.planned = False  # whether an option of the graph is running
 
     def act(self, observation: Any, state: tuple[np.ndarray, ...] | None) -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
         action, new_state, outcomes = self.agent.act(observation, state)
         self.trace.count(outcomes)
         if self.end is not None and self.trace.followed is None and self.end.holds(np.asarray(observation["achieved_goal"])):
             self.trace.followed = True
-        self.trace.planned_steps += int(new_state.option[0] != GLOBAL)
+        self.planned = bool(new_state.option[0] != GLOBAL)
+        self.trace.planned_steps += self.planned
         return action, new_state
 
-    def ended(self, success: bool) -> SkillTrace:
+    def ended(self, success: bool, stuck: bool) -> SkillTrace:
+        self.trace.n_runs += stuck and self.planned  # a run that getting stuck has ended
         if self.trace.followed is None:
             self.trace.followed = success
         return self.trace

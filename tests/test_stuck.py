@@ -18,6 +18,7 @@ from sb3_skillgraph.baselines import CoveringOptions
 from sb3_skillgraph.controller import FAILED, GLOBAL, ControllerState, Request
 from sb3_skillgraph.evaluation import run_pair
 from sb3_skillgraph.events import SalientEvent
+from sb3_skillgraph.plotting import run_plan
 
 PIT, DEPTH = np.array([0.0, 1.4]), 0.45  # beside the way from the toy maze's start
 
@@ -193,6 +194,38 @@ class Up:
 
     def predict(self, observation: Any, *_: Any, **__: Any) -> tuple[np.ndarray, None]:
         return np.array([0.0, 1.0], dtype=np.float32), None
+
+
+def test_a_picture_ends_where_the_agent_is_stuck(trained: SkillGraphAgent) -> None:
+    env = Pit(gym.make(TOY))
+    trajectory, _ = run_plan(trained, env, PIT - [DEPTH + 0.05, 0.0], np.array([1.0, 1.4]))  # straight through it
+    assert in_pit(trajectory.points[-1:]).all()
+    assert not in_pit(trajectory.points[:-1]).any()
+    assert not trajectory.success
+
+
+def test_a_fall_is_a_failure_of_the_option_that_ran(trained: SkillGraphAgent) -> None:
+    env = Pit(gym.make(TOY, terminate_on_success=True))
+    traces = []
+    for goal in ([1.0, 1.0], [1.0, -1.0]):
+        for x in np.linspace(-1.2, -DEPTH - 0.05, 12):  # on the way along the upper corridor
+            pair = run_pair(trained, env, np.array([x, 1.4]), np.array(goal), np.nan)
+            if pair.stuck and pair.trace is not None and pair.trace.planned_steps:
+                traces.append(pair.trace)
+    assert any(trace.n_runs > trace.n_successes for trace in traces)
+    assert not any(trace.followed for trace in traces)
+
+
+def test_getting_stuck_on_the_last_step_of_an_episode() -> None:
+    agent = new_agent(pit_env(max_steps=4)).learn(1000, log_interval=None)
+    store, rows = agent.store, np.arange(1000)
+    fallen = in_pit(store.column("next_achieved_goal", rows))
+    trajectory = store.get_state()["trajectory"][:1000]
+    assert (np.bincount(trajectory)[trajectory[fallen]] == 4).any()  # it falls, and its time is up
+    np.testing.assert_array_equal(store.stuck(rows), fallen)
+    assert agent.curriculum.n_stuck == fallen.sum()
+    samples = agent.global_option.replay.sample(1000)
+    assert (samples.dones[samples.rewards < -50.0] == 1.0).all()
 
 
 @pytest.mark.parametrize(("x", "stuck"), [(0.0, True), (-1.2, False)])

@@ -37,7 +37,7 @@ def run_plan(
     agent: SkillGraphAgent, env: gym.Env, start: np.ndarray | None = None, goal: np.ndarray | None = None
 ) -> tuple[Trajectory, Plan]:
     """
-    Plan, and execute one episode, until the goal is reached or the episode ends.
+    Plan, and execute one episode, until the goal is reached, the episode ends, or the agent is stuck.
 
     :param agent: the agent
     :param env: a goal environment; start and goal need one whose ``reset`` takes them as ``options``
@@ -56,10 +56,10 @@ def run_plan(
         action, state = agent.predict(observation, state=state, deterministic=True)
         assert state is not None
         options.append(int(state[0][0]))
-        observation, _, terminated, truncated, _ = env.step(action)
+        observation, _, terminated, truncated, info = env.step(action)
         points.append(np.array(observation["achieved_goal"], dtype=np.float64))
         reached = bool(np.linalg.norm(points[-1] - target) <= agent.event_radius)
-        over = reached or terminated or truncated
+        over = reached or terminated or truncated or bool(info.get("stuck"))
     return Trajectory(np.stack(points), np.array(options, dtype=np.int64), target, reached), plan
 
 
