@@ -91,7 +91,10 @@ args.out.mkdir(parents=True, exist_ok=True)
 geometry = env.get_wrapper_attr("geometry")
 x_min, x_max, _, _ = geometry.extent
 
-film = Film(task.model, x_max - x_min)
+try:
+    film = Film(task.model, x_max - x_min)
+except (AttributeError, RuntimeError, mujoco.FatalError) as error:  # whichever comes of there being no screen
+    parser.error(f"MuJoCo cannot draw here ({error}): set MUJOCO_GL=egl or MUJOCO_GL=osmesa")
 for number, goal in enumerate(np.array(args.goal)):
     observation = set_goal(env, observation, goal)
     film.shoot(task.data)

@@ -584,6 +584,12 @@ def test_an_ant_need_not_be_that_of_d4rl():
     assert pickle.loads(pickle.dumps(env)).unwrapped.tell_stuck is False
 
 
+@pytest.mark.parametrize("kwargs", [{"torque": 0}, {"torque": np.nan}, {"frame_skip": 0}, {"frame_skip": 5.5}], ids=str)
+def test_an_ant_that_cannot_be(kwargs):
+    with pytest.raises(ValueError, match=rf"{next(iter(kwargs))} must be a .*, not"):
+        make(ANT, **kwargs)
+
+
 def test_random_actions_rarely_flip_the_ant():
     env = make("SkillGraph/AntReacher-v0")
     env.action_space.seed(0)
