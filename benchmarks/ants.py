@@ -25,7 +25,7 @@ import numpy as np
 import torch as th
 
 from sb3_skillgraph import SkillGraphAgent, __version__
-from sb3_skillgraph.baselines import RandomWalk
+from sb3_skillgraph.baselines import random_walk
 from sb3_skillgraph.envs import MazeGeometry
 from sb3_skillgraph.evaluation import run_pair, sample_pairs
 from sb3_skillgraph.run_folder import CONFIG, checkpoints, load_agent
@@ -49,8 +49,7 @@ def walk(agent: SkillGraphAgent, env: gym.Env, pairs: Sequence[tuple[np.ndarray 
 def farthest_cell(geometry: MazeGeometry) -> np.ndarray:
     """Return the middle of the free cell with the longest path from the training start."""
     start = geometry.cell_to_xy(*geometry.start_cell)
-    free = [geometry.cell_to_xy(*cell) for cell in np.ndindex(len(geometry.maze_map), len(geometry.maze_map[0]))]
-    free = [point for point in free if geometry.is_free(point, 0.1).all()]
+    free = [geometry.cell_to_xy(*cell) for cell in geometry.free_cells]
     return max(free, key=lambda point: geometry.shortest_path_length(start, point))
 
 
@@ -68,19 +67,6 @@ def visited_share(geometry: MazeGeometry, points: np.ndarray) -> float:
     origin = np.array([x_min, y_min])
     seen = {tuple(corner) for corner in origin + np.floor(points - origin)}
     return len(free & seen) / len(free)
-
-
-def random_walk(env: gym.Env, seed: int) -> np.ndarray:
-    """Return where a random walk gets."""
-    assert isinstance(env.action_space, gym.spaces.Box)
-    walker, points = RandomWalk(env.action_space, seed), []
-    observation, _ = env.reset(seed=seed)
-    for _ in range(N_LAST):
-        observation, _, _, truncated, info = env.step(walker.predict(observation)[0])
-        points.append(observation["achieved_goal"])
-        if truncated or info.get("stuck"):
-            observation, _ = env.reset()
-    return np.array(points)
 
 
 def test_run(folder: pathlib.Path) -> dict[str, Any]:
@@ -102,7 +88,7 @@ def test_run(folder: pathlib.Path) -> dict[str, Any]:
     visits = {
         "agent": visited_share(geometry, agent.store.column("next_achieved_goal", last)),
         "random walk": visited_share(
-            geometry, random_walk(gym.make(config["env_id"], **config["env_kwargs"]), config["seed"])
+            geometry, random_walk(gym.make(config["env_id"], **config["env_kwargs"]), config["seed"], N_LAST)
         ),
     }
     summary = {kind: rates(walked) for kind, walked in walks.items()}

@@ -267,7 +267,6 @@ class SkillGraphAgent(Rollouts):
         for name, value in self.graph_summary().items():
             self.logger.record(f"skillgraph/{name}", value)
         self.logger.record("skillgraph/rejected_events", self.discovery.n_rejected)
-        self.logger.record("skillgraph/stuck", self.curriculum.n_stuck)
         super().dump_logs()
 
     def graph_summary(self) -> dict[str, float]:
@@ -275,7 +274,7 @@ class SkillGraphAgent(Rollouts):
 
         :return: ``events``; ``options`` (mature) and ``edges``; ``joined_pairs``, the share of ordered event pairs
             joined by a path; ``coverage``, the share of visited states from which some vertex can be entered;
-            ``success_rate``, the mean over the options
+            ``success_rate``, the mean over the options; ``stuck``, episodes given up since the agent was stuck
         """
         options = list(self.graph.options.values())
         rates = [option.success_rate(self.graph.rate_prior) for option in options]
@@ -286,6 +285,7 @@ class SkillGraphAgent(Rollouts):
             "joined_pairs": self.graph.joined_pairs(),
             "coverage": self.planner.coverage(),
             "success_rate": float(np.mean(rates)) if rates else 0.0,
+            "stuck": self.curriculum.n_stuck,
         }
 
     # -- acting -------------------------------------------------------------------------------------------------------

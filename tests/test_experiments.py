@@ -39,7 +39,7 @@ SMALL_NETS = {
 
 
 def spec(algorithm: str = "skill_graph", steps: int = 600, **changes: Any) -> RunSpec:
-    arguments = SMALL_NETS if algorithm in ("skill_graph", "planning_off") else {}
+    arguments = SMALL_NETS if algorithm in ("skill_graph", "planning_off", "recipe") else {}
     values: dict[str, Any] = dict(check_every=200, pairs=3, final_pairs=4, arguments=arguments, seed=0, test_pairs=0)
     return RunSpec(algorithm, "toy", algorithm=algorithm, env_id=TOY, steps=steps, **{**values, **changes})
 
@@ -65,7 +65,9 @@ def plan(path: Path, **changes: Any) -> Path:
 # -- one run ----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("algorithm", ["skill_graph", "planning_off", "uvfa", "her", "covering_options", "random_walk"])
+@pytest.mark.parametrize(
+    "algorithm", ["skill_graph", "planning_off", "uvfa", "her", "recipe", "covering_options", "random_walk"]
+)
 def test_a_run_leaves_everything_and_is_not_done_again(algorithm: str, tmp_path: Path) -> None:
     arguments = {"covering_options": {"n_options": 2, "option_updates": 20}}
     changes = {"arguments": arguments[algorithm]} if algorithm in arguments else {}

@@ -2,7 +2,7 @@
 
 from sb3_skillgraph.baselines.covering_options import CoveringOptions
 from sb3_skillgraph.baselines.goal_conditioned import GoalSchedule, OptionTask, make_her, make_uvfa
-from sb3_skillgraph.baselines.random_walk import RandomWalk
+from sb3_skillgraph.baselines.random_walk import RandomWalk, random_walk
 from sb3_skillgraph.baselines.recipe import HindsightRecipe, NewGoals
 
 __all__ = [
@@ -14,4 +14,5 @@ __all__ = [
     "RandomWalk",
     "make_her",
     "make_uvfa",
+    "random_walk",
 ]

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from sb3_skillgraph.agent import SkillGraphAgent
-from sb3_skillgraph.baselines import RandomWalk
+from sb3_skillgraph.baselines import random_walk
 from sb3_skillgraph.envs import MazeGeometry
 from sb3_skillgraph.experiments.plan import RunSpec
 from sb3_skillgraph.experiments.runner import DONE, STRETCH, is_done
@@ -116,27 +116,13 @@ def exploration(specs: Sequence[RunSpec], out: Path) -> Axes:
     """Figure 4: where the agent has been, and where a random walk gets in the same steps."""
     spec = _finished(specs, out)[0]
     visits, geometry = _visits(_agent(spec, out)), _geometry(spec)
-    walked = _random_walk(spec, len(visits))
+    walked = random_walk(gym.make(spec.env_id, **spec.env_kwargs), spec.seed, len(visits))
     panels = draw.new_panels(6, n_rows=2)
     for name, points, row in ((_name(spec), visits, panels[:3]), ("random walk", walked, panels[3:])):
         for axes, share in zip(row, (0.1, 0.4, 1.0), strict=True):
             n_steps = int(share * len(points))
             draw.plot_visits(axes, points[:n_steps], geometry, f"{name}, {n_steps:,} steps")
     return panels[0]
-
-
-def _random_walk(spec: RunSpec, n_steps: int) -> np.ndarray:
-    env = gym.make(spec.env_id, **spec.env_kwargs)
-    assert isinstance(env.action_space, gym.spaces.Box)
-    walk, points = RandomWalk(env.action_space, spec.seed), []
-    observation, _ = env.reset(seed=spec.seed)
-    for _ in range(n_steps):
-        observation, _, terminated, truncated, _ = env.step(walk.predict(observation)[0])
-        points.append(observation["achieved_goal"])
-        if terminated or truncated:
-            observation, _ = env.reset()
-    env.close()
-    return np.array(points)
 
 
 def curves(specs: Sequence[RunSpec], out: Path) -> Axes:

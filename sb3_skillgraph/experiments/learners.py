@@ -154,8 +154,7 @@ class SkillGraphLearner(Learner):
 
     def summary(self) -> dict[str, float]:
         """Describe the graph, and count how often the agent got stuck."""
-        described = {**self.agent.graph_summary(), "stuck": self.agent.curriculum.n_stuck}
-        return {f"skillgraph/{name}": value for name, value in described.items()}
+        return {f"skillgraph/{name}": value for name, value in self.agent.graph_summary().items()}
 
     def snapshot(self) -> dict[str, Any]:
         """Return events and what joins them."""
