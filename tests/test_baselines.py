@@ -22,7 +22,7 @@ from sb3_skillgraph.baselines import (
     make_her,
     make_uvfa,
 )
-from sb3_skillgraph.baselines.covering_options import TERMINATION_SHARE, LowEnd
+from sb3_skillgraph.baselines.covering_replay import TERMINATION_SHARE, LowEnd
 from sb3_skillgraph.options.learner import OptionTD3
 from sb3_skillgraph.options.option import goal_rule
 

@@ -12,9 +12,10 @@ from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.logger import Logger
 
 from sb3_skillgraph.options import learner as learner_module
-from sb3_skillgraph.options.fast_update import FastUpdate, StepSettings, is_vector_space
+from sb3_skillgraph.options.fast_update import FastUpdate, StepSettings
 from sb3_skillgraph.options.learner import OptionDDPG, OptionTD3
 from sb3_skillgraph.options.numpy_actor import NumpyActor
+from sb3_skillgraph.options.plain_networks import is_vector_space
 
 
 @pytest.fixture(autouse=True)

@@ -14,13 +14,13 @@ from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 import torch as th
-from gymnasium import spaces
 from stable_baselines3.common.policies import ContinuousCritic
-from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.td3.policies import Actor, TD3Policy
 from torch import nn
+
+from sb3_skillgraph.options.plain_networks import is_plain, is_vector_space, linears
 
 # A call of oneDNN costs about 10 us more than one of MKL: only layers with this many weights win it back.
 ONEDNN_MIN_WEIGHTS = 32_768
@@ -356,34 +356,6 @@ def why_not(policy: Any) -> str | None:
     return _why_not_adam(policy.actor) or _why_not_adam(policy.critic)
 
 
-def is_vector_space(space: spaces.Space) -> bool:
-    """
-    :param space: an observation space
-    :return: whether SB3 hands observations of it to a network as they are, flattened
-    """
-    return isinstance(space, spaces.Box) and len(space.shape) > 0 and not is_image_space(space)
-
-
-def is_plain(network: nn.Module, squashed: bool = False) -> bool:
-    """
-    :param network: any module
-    :param squashed: whether a Tanh must follow the last layer
-    :return: whether it is float32 Linear layers with biases and a ReLU between one and the next
-    """
-    if type(network) is not nn.Sequential:
-        return False
-    modules = list(network)
-    if squashed and (not modules or type(modules.pop()) is not nn.Tanh):
-        return False
-    linears, relus = modules[::2], modules[1::2]
-    return (
-        len(modules) % 2 == 1
-        and all(type(module) is nn.ReLU for module in relus)
-        and all(type(module) is nn.Linear and module.bias is not None for module in linears)
-        and all(parameter.dtype == th.float32 for parameter in network.parameters())
-    )
-
-
 def _why_not_adam(model: nn.Module) -> str | None:
     optimizer = model.optimizer
     if type(optimizer) is not th.optim.Adam:
@@ -396,14 +368,6 @@ def _why_not_adam(model: nn.Module) -> str | None:
         if groups[0].get(option, False):
             return f"Adam's {option} is on"
     return None
-
-
-def linears(network: nn.Module) -> list[nn.Linear]:
-    """
-    :param network: one that ``is_plain``
-    :return: its linear layers, first to last
-    """
-    return [module for module in network.children() if isinstance(module, nn.Linear)]
 
 
 def _flat(observations: th.Tensor) -> th.Tensor:

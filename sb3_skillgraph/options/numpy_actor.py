@@ -8,7 +8,7 @@ from stable_baselines3.sac.policies import Actor as SACActor
 from stable_baselines3.td3.policies import Actor
 from torch import nn
 
-from sb3_skillgraph.options.fast_update import is_plain, is_vector_space, linears
+from sb3_skillgraph.options.plain_networks import is_plain, is_vector_space, linears
 
 
 class NumpyActor:
