@@ -62,6 +62,14 @@ def plan(path: Path, **changes: Any) -> Path:
     return path
 
 
+PLANS = sorted((Path(__file__).parents[1] / "benchmarks").glob("*.yml"))
+
+
+@pytest.mark.parametrize("file", PLANS, ids=lambda path: path.stem)
+def test_the_plans_of_the_benchmarks_can_be_read(file: Path) -> None:
+    assert load_plan(file)
+
+
 # -- one run ----------------------------------------------------------------------------------------------------------
 
 
