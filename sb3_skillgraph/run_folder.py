@@ -33,8 +33,10 @@ def is_unfinished(folder: Path) -> bool:
     :param folder: of the run
     :raises ValueError: if its agent is damaged
     """
-    if checkpoints(folder) or not ((folder / AGENT).exists() and (folder / CONFIG).exists()):
-        return bool(checkpoints(folder))
+    if checkpoints(folder):
+        return True
+    if not ((folder / AGENT).exists() and (folder / CONFIG).exists()):
+        return False
     n_steps: int = load_tree(folder / AGENT, "agent")["progress"]["counters"]["num_timesteps"]
     return n_steps < int(json.loads((folder / CONFIG).read_text())["steps"])
 

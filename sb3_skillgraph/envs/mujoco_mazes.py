@@ -173,7 +173,7 @@ class AntMazeEnv(MujocoMazeTask, ant_maze_v5.AntMazeEnv):
         geometry = make_geometry(maze_map, _ANT_CELL_SIZE)
         if not (math.isfinite(torque) and torque > 0):
             raise ValueError(f"torque must be a positive number, not {torque!r}")
-        if int(frame_skip) != frame_skip or frame_skip < 1:
+        if not isinstance(frame_skip, int | np.integer) or frame_skip < 1:
             raise ValueError(f"frame_skip must be a whole number of simulator steps, at least 1, not {frame_skip!r}")
         with private_temporary_directory():
             super().__init__(
