@@ -1,8 +1,11 @@
 """What the agent does at every environment step: SB3's hooks for roll-outs and training (section 3, Figure 10)."""
 
 import copy
+import functools
 import time
+import warnings
 from collections.abc import Sequence
+from itertools import compress
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,6 +20,9 @@ from sb3_skillgraph.controller import GLOBAL, ControllerState, Request
 from sb3_skillgraph.goal_env import check_finite, rows, with_terminal
 from sb3_skillgraph.interrupts import Interrupts
 from sb3_skillgraph.options.option import Option
+
+#: What an environment may tell in ``info`` where it ends an episode, by the names in use.
+EXPLAINED = ("stuck", "success", "is_success")
 
 
 class _Pending(NamedTuple):
@@ -185,6 +191,8 @@ class Rollouts(Assembly):
         terminated = dones
         if dones.any():
             terminated = dones & ~np.array([info.get("TimeLimit.truncated", False) for info in infos])
+            if any(not any(info.get(why) for why in EXPLAINED) for info in compress(infos, terminated)):
+                _warn_of_ends()
         row = self.store.add(
             step.observation["observation"],
             before,
@@ -243,3 +251,13 @@ class Rollouts(Assembly):
             self._credit -= min(self._credit, 1.0)
             return self.global_option
         return trainable[self._n_updates % len(trainable)]
+
+
+@functools.cache
+def _warn_of_ends() -> None:
+    warnings.warn(
+        "The environment ended an episode (terminated) without telling success or, in info['stuck'], that the agent can do "
+        "nothing any more. An end as such costs options nothing, so that they learn to seek it: where it is a failure, let "
+        "the environment tell, for example with TellStuck.",
+        stacklevel=4,
+    )

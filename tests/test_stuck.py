@@ -2,6 +2,7 @@
 
 import copy
 import csv
+import warnings
 from typing import Any
 
 import gymnasium as gym
@@ -13,7 +14,7 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
-from sb3_skillgraph import OptionEnv, OptionsEnv, SkillGraphAgent
+from sb3_skillgraph import OptionEnv, OptionsEnv, SkillGraphAgent, rollouts
 from sb3_skillgraph.baselines import CoveringOptions
 from sb3_skillgraph.controller import FAILED, GLOBAL, ControllerState, Request
 from sb3_skillgraph.evaluation import run_pair
@@ -138,6 +139,30 @@ def test_learning_resumes_exactly(tmp_path: Any) -> None:
     resumed.load_replay_buffer(tmp_path / "replay.zip")
     resumed.learn(600, reset_num_timesteps=False, log_interval=None)
     assert differences(without_clock(state_of(resumed)), without_clock(state_of(whole))) == []
+
+
+class Deadly(Pit):
+    """The episode ends in the pit, and nothing else tells why."""
+
+    told: dict[str, bool]
+
+    def step(self, action: np.ndarray) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        observation, reward, _, truncated, _ = super().step(action)
+        return observation, reward, self.stuck, truncated, dict(self.told)
+
+
+@pytest.mark.parametrize("told", [{}, {"stuck": False, "is_success": False}, {"stuck": True}, {"is_success": True}])
+def test_an_end_that_is_not_explained(told: dict[str, bool]) -> None:
+    env = Deadly(gym.make(TOY))
+    env.told = told
+    agent = new_agent(env)
+    rollouts._warn_of_ends.cache_clear()
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        agent.learn(1000, log_interval=None)
+    assert agent.store.terminated(np.arange(1000)).sum() > 1
+    texts = [str(each.message) for each in caught if "TellStuck" in str(each.message)]
+    assert len(texts) == (not any(told.values()))  # once, however often it happens
 
 
 def test_adaptation_starts_over_where_it_is_told_to() -> None:
