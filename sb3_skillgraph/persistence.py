@@ -280,11 +280,14 @@ class Persistence(Parameters):
         Give the agent another environment with the same spaces and the same number of copies.
 
         :param env: the environment
-        :param force_reset: whether ``learn`` begins at a fresh episode
+        :param force_reset: whether ``learn`` begins at a fresh episode; False to go on, after ``load``, where the saved
+            environments were
         :raises ValueError: if the environment does not fit, or is normalised by VecNormalize
         """
         refuse_vec_normalize(env)
         super().set_env(env, force_reset)
+        if force_reset:
+            self._env_snapshot, self._loaded = None, False
 
     def _restore_env(self) -> bool:
         """Put the environments where they were when the agent was saved, if that is known.

@@ -160,8 +160,17 @@ def test_environment_given_later(tmp_path: Path) -> None:
     half.save_replay_buffer(tmp_path / "half_replay")
     resumed = SkillGraphAgent.load(tmp_path / "half")
     resumed.load_replay_buffer(tmp_path / "half_replay")
-    resumed.set_env(gym.make(TOY))
+    resumed.set_env(gym.make(TOY), force_reset=False)
     check_equal(expected, state_of(resumed.learn(301, reset_num_timesteps=False)))
+
+
+def test_environment_given_later_begins_a_fresh_episode(tmp_path: Path) -> None:
+    new_agent().learn(301).save(tmp_path / "half")
+    resumed = SkillGraphAgent.load(tmp_path / "half")
+    env = Recorder(gym.make(TOY))
+    resumed.set_env(env)
+    resumed.learn(50, reset_num_timesteps=False)
+    np.testing.assert_array_equal(env.transitions[0]["achieved_goal"], env.starts[0])
 
 
 def test_in_three_parts_without_files() -> None:
