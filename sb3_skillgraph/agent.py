@@ -74,8 +74,8 @@ class SkillGraphAgent(Rollouts):
         them learn from scratch
     :param global_update_fraction: share of the updates that goes to the global option; executed options share the rest
         (which the global option takes too while none of them is to be trained)
-    :param saturation_penalty: weight, in the loss of ``OptionDDPG``'s and ``OptionTD3``'s actors, of the mean square of
-        what their tanh is given: keeps them from getting stuck at the bounds of the actions
+    :param saturation_penalty: weight, in the loss of ``OptionDDPG``'s and ``OptionTD3``'s actors, of the mean squared
+        norm of what their tanh is given: keeps them from getting stuck at the bounds of the actions
     :param shaping: reward for every event radius of distance gained, beside -1 a step; 0 for none [2.1]
     :param hindsight: share of sampled transitions relabelled with a goal achieved later
     :param doomed_steps: environment steps before the agent got stuck in which none are relabelled

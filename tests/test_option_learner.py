@@ -332,7 +332,7 @@ def test_numpy_actor_asks_torch_about_other_networks():
 
 
 @pytest.mark.parametrize("ours", [OptionDDPG, OptionTD3])
-def test_the_saturation_penalty_is_the_mean_square_before_the_tanh(ours):
+def test_the_saturation_penalty_is_the_mean_squared_norm_before_the_tanh(ours):
     model = make(ours, [64, 64], policy_kwargs={"net_arch": [64, 64]}, saturation_penalty=0.1)
     with th.no_grad():
         model.actor.mu[-2].bias.fill_(2.0)

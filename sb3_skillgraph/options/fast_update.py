@@ -225,7 +225,7 @@ class StepSettings(NamedTuple):
     :param tau: SB3's soft update coefficient, 1 copies
     :param noise_std: standard deviation of the noise on the target's actions (TD3's smoothing)
     :param noise_clip: largest size of that noise
-    :param saturation_penalty: weight, in the actor's loss, of the mean square of what its tanh is given
+    :param saturation_penalty: weight, in the actor's loss, of the mean squared norm of what its tanh is given
     """
 
     gamma: float

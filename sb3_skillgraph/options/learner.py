@@ -36,8 +36,8 @@ class OptionLearner(TD3):
     :param env: the environment to learn from (if registered in Gym, can be str; None builds no environment)
     :param actor_learning_rate: Adam's learning rate for the actor
     :param critic_learning_rate: Adam's learning rate for the critics
-    :param saturation_penalty: weight, in the actor's loss, of the mean square of what its tanh is given: an actor that
-        an untrained critic has driven to the bounds of the actions finds its way back; 0 is SB3's loss
+    :param saturation_penalty: weight, in the actor's loss, of the mean squared norm of what its tanh is given: an actor
+        that an untrained critic has driven to the bounds of the actions finds its way back; 0 is SB3's loss
     :param kwargs: all other arguments of the SB3 class except ``learning_rate``, which these two replace
     """
 
@@ -137,8 +137,8 @@ class OptionDDPG(OptionLearner, DDPG):
     :param env: the environment to learn from (if registered in Gym, can be str; None builds no environment)
     :param actor_learning_rate: Adam's learning rate for the actor
     :param critic_learning_rate: Adam's learning rate for the critics
-    :param saturation_penalty: weight, in the actor's loss, of the mean square of what its tanh is given: an actor that
-        an untrained critic has driven to the bounds of the actions finds its way back; 0 is SB3's loss
+    :param saturation_penalty: weight, in the actor's loss, of the mean squared norm of what its tanh is given: an actor
+        that an untrained critic has driven to the bounds of the actions finds its way back; 0 is SB3's loss
     :param kwargs: all other arguments of ``stable_baselines3.DDPG`` except ``learning_rate``
     """
 
@@ -154,8 +154,8 @@ class OptionTD3(OptionLearner, TD3):
     :param env: the environment to learn from (if registered in Gym, can be str; None builds no environment)
     :param actor_learning_rate: Adam's learning rate for the actor
     :param critic_learning_rate: Adam's learning rate for the critics
-    :param saturation_penalty: weight, in the actor's loss, of the mean square of what its tanh is given: an actor that
-        an untrained critic has driven to the bounds of the actions finds its way back; 0 is SB3's loss
+    :param saturation_penalty: weight, in the actor's loss, of the mean squared norm of what its tanh is given: an actor
+        that an untrained critic has driven to the bounds of the actions finds its way back; 0 is SB3's loss
     :param kwargs: all other arguments of ``stable_baselines3.TD3`` except ``learning_rate``
     """
 
