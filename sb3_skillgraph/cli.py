@@ -22,7 +22,7 @@ from sb3_skillgraph.evaluation import NoPairsError, PairsResult, evaluate_pairs
 from sb3_skillgraph.experiments.commands import add_compare, add_figure, add_status
 from sb3_skillgraph.hyperparams import check_hyperparams, did_you_mean, load_hyperparams
 from sb3_skillgraph.plotting import plot_plan, plot_skill_graph, run_plan, save_figure
-from sb3_skillgraph.run_folder import AGENT, is_unfinished
+from sb3_skillgraph.run_folder import AGENT, EXPERIENCE, is_unfinished
 from sb3_skillgraph.training import train, write_json
 
 DEMO_ENV, DEMO_STEPS, DEMO_PAIRS = "SkillGraph/PointMazeMedium-v0", 100_000, 100
@@ -87,8 +87,9 @@ def _add_train(commands: Any) -> None:
         _train,
         "Train an agent on a goal environment, without reward.",
         "Arguments of the agent come from its signature, then from the environment's entry in hyperparams/*.yml, then\n"
-        "from --hyperparams. OUT receives agent.zip, progress.csv and config.json. Ctrl-C saves the agent, too. However\n"
-        "it was interrupted, the same command goes on from the last checkpoint, and comes to the same as in one go.\n\n"
+        "from --hyperparams. OUT receives agent.zip, experience.zip (what it has met, for evaluate --adapt), progress.csv\n"
+        "and config.json. Ctrl-C saves the agent, too. However it was interrupted, the same command goes on from the last\n"
+        "checkpoint, and comes to the same as in one go (of environments that tell their state, as SkillGraph/* do).\n\n"
         "example:\n  sb3-skillgraph train SkillGraph/PointMazeUMaze-v0 --steps 50000 --out runs/umaze\n"
         "  sb3-skillgraph train SkillGraph/ToyMaze-v0 --hyperparams salience=rrt policy_kwargs='{net_arch: [64, 64]}'",
     )
@@ -121,7 +122,8 @@ def _add_evaluate(commands: Any) -> None:
         "evaluate",
         _evaluate,
         "Measure how often a trained agent gets from a random start to a random goal of a maze.",
-        "With --adapt, a copy of the agent first learns for so many steps with each goal (few-shot).\n\n"
+        "With --adapt, a copy of the agent first learns for so many steps with each goal (few-shot), also from the\n"
+        "experience.zip beside AGENT.zip.\n\n"
         "example:\n  sb3-skillgraph evaluate runs/umaze/agent.zip --env SkillGraph/PointMazeUMaze-v0 --pairs 100",
     )
     command.add_argument("agent", type=Path, metavar="AGENT.zip", help="what train saved")
@@ -154,8 +156,9 @@ def _add_demo(commands: Any) -> None:
         "demo",
         _demo,
         f"Train on {DEMO_ENV}, evaluate random pairs of start and goal, and draw pictures.",
-        "The table compares the agent, the same agent with planning off, and a random walk. OUT receives agent.zip,\n"
-        "progress.csv, config.json, results.json, skill_graph.png and plan.png. A few minutes on two cores.\n\n"
+        "The table compares the agent, the same agent with planning off, and a random walk. OUT receives\n"
+        "agent.zip, experience.zip, progress.csv, config.json, results.json, skill_graph.png and plan.png. A few minutes on\n"
+        "two cores.\n\n"
         "example:\n  sb3-skillgraph demo --out runs/demo",
     )
     command.add_argument("--steps", type=positive, default=DEMO_STEPS, help=f"environment steps (default: {DEMO_STEPS})")
@@ -188,6 +191,8 @@ def _evaluate(args: argparse.Namespace) -> int:
         if not env.has_wrapper_attr("geometry"):
             raise UserError(f"evaluate draws its pairs from the walls of a maze, and {args.env!r} is none.")
         agent = _load(args.agent, env)
+        if args.adapt:
+            _load_experience(agent, args.agent.with_name(EXPERIENCE))
         agent.planning = not args.no_planning
         result = evaluate_pairs(
             agent, args.env, env_kwargs=env_kwargs, n_pairs=args.pairs, seed=args.seed, adapt_timesteps=args.adapt
@@ -264,6 +269,13 @@ def _make_env(env_id: str, env_kwargs: dict[str, Any]) -> gym.Env:
 def _load(path: Path, env: gym.Env) -> SkillGraphAgent:
     with for_people():
         return SkillGraphAgent.load(path, env=env)
+
+
+def _load_experience(agent: SkillGraphAgent, path: Path) -> None:
+    try:
+        agent.load_replay_buffer(path)
+    except (ValueError, OSError) as error:  # none there, or that of several environments
+        print(f"the agent adapts without what it met in training: {error}")
 
 
 def _draw(

@@ -13,7 +13,7 @@ from stable_baselines3.common.type_aliases import GymEnv
 from sb3_skillgraph.agent import SkillGraphAgent
 from sb3_skillgraph.saving import load_tree
 
-AGENT, CONFIG, PROGRESS = "agent.zip", "config.json", "progress.csv"
+AGENT, EXPERIENCE, CONFIG, PROGRESS = "agent.zip", "experience.zip", "config.json", "progress.csv"
 STEPS = "time/total_timesteps"
 
 
@@ -75,7 +75,7 @@ def save_agent(agent: SkillGraphAgent, folder: Path) -> None:
     :param folder: of a checkpoint
     """
     agent.save(folder / AGENT)
-    agent.save_replay_buffer(folder / "experience")
+    agent.save_replay_buffer(folder / EXPERIENCE)
 
 
 def load_agent(folder: Path, env: GymEnv, device: th.device | str = "auto") -> SkillGraphAgent:
@@ -86,7 +86,7 @@ def load_agent(folder: Path, env: GymEnv, device: th.device | str = "auto") -> S
     :param device: torch device
     """
     agent = SkillGraphAgent.load(folder / AGENT, env=env, device=device)
-    agent.load_replay_buffer(folder / "experience")
+    agent.load_replay_buffer(folder / EXPERIENCE)
     return agent
 
 

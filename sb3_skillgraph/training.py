@@ -49,8 +49,8 @@ def train(
     :param arguments: of :class:`~sb3_skillgraph.SkillGraphAgent`
     :param steps: environment steps in all
     :param seed: of everything random
-    :param out: receives ``agent.zip`` (when interrupted, too), ``progress.csv``, ``config.json`` and, until the end, the
-        newest checkpoint
+    :param out: receives ``agent.zip`` and ``experience.zip`` (when interrupted, too), ``progress.csv``, ``config.json``
+        and, until the end, the newest checkpoint
     :param n_envs: copies of the environment
     :param device: torch device
     :param verbose: whether to print SB3's table as well as the progress bar
@@ -65,32 +65,36 @@ def train(
         env = make_vec_env(env_id, n_envs=n_envs, env_kwargs=env_kwargs)
     try:
         with for_people():
+            begin = max(saved, default=0)
             if saved:
-                agent = load_agent(saved[max(saved)], env, device)
-                print(f"going on after {agent.num_timesteps} steps")
+                agent = load_agent(saved[begin], env, device)
+                fresh = "" if env.has_attr("get_state") else f", at a fresh episode: {env_id} cannot tell its state"
+                print(f"going on after {begin} steps{fresh}")
             else:
                 agent = SkillGraphAgent(env=env, seed=seed, **{"device": device, **arguments})
         out.mkdir(parents=True, exist_ok=True)
         write_json(out / CONFIG, {**config, "versions": versions()})
         agent.set_logger(_logger(out, agent.num_timesteps, verbose))
-        _learn(agent, steps, out)
+        _learn(agent, begin, steps, out)
         return agent
     finally:
         env.close()
 
 
-def _learn(agent: SkillGraphAgent, steps: int, out: Path) -> None:
+def _learn(agent: SkillGraphAgent, begin: int, steps: int, out: Path) -> None:
     bar = SkillGraphProgressBarCallback(steps)
     try:
-        for target in stops(agent.num_timesteps, steps, CHECKPOINT_EVERY):
-            agent.learn(target - agent.num_timesteps, callback=bar, reset_num_timesteps=False)
+        for target in stops(begin, steps, CHECKPOINT_EVERY):
+            # By what was asked for: a call of several environments may overshoot, and the next makes up for it.
+            agent.learn(target - begin, callback=bar, reset_num_timesteps=False)
+            begin = target
             if target < steps:
-                take_checkpoint(out, agent.num_timesteps, lambda folder: save_agent(agent, folder))
+                take_checkpoint(out, target, lambda folder: save_agent(agent, folder))
     finally:
         bar.close()
         agent.logger.close()
         if agent.num_timesteps > 0:
-            agent.save(out / AGENT)
+            save_agent(agent, out)
             print(f"{agent.num_timesteps} steps; the agent is in {out / AGENT}, its log in {out / PROGRESS}")
         if agent.num_timesteps < steps:
             print(f"the same command goes on after {max(checkpoints(out), default=0)} steps")

@@ -9,6 +9,7 @@ from conftest import differences, state_of, without_clock
 from sb3_skillgraph import SkillGraphAgent, cli, training
 from sb3_skillgraph.callbacks import SkillGraphProgressBarCallback
 from sb3_skillgraph.envs import _TASKS
+from sb3_skillgraph.evaluation import evaluate_pairs
 from sb3_skillgraph.hyperparams import FILE, load_hyperparams
 from sb3_skillgraph.options.learner import OptionTD3
 from sb3_skillgraph.run_folder import checkpoints, read_progress
@@ -129,6 +130,14 @@ class TestTrain:
         assert differences(without_clock(state_of(a)), without_clock(state_of(b))) == []
         assert "holds an agent already" in error_line(capsys, [*command, str(broken)])
 
+    def test_several_environments_that_overshoot_checkpoints(self, tmp_path, capsys, monkeypatch):
+        monkeypatch.setattr(training, "CHECKPOINT_EVERY", 100)
+        command = ["train", TOY, "--steps", "500", "--n-envs", "6", "--out", str(tmp_path)]
+        assert cli.main(command) == 0
+        assert "goes on" not in capsys.readouterr().out
+        assert SkillGraphAgent.load(tmp_path / "agent.zip").num_timesteps == 504  # the first multiple of 6
+        assert "holds an agent already" in error_line(capsys, command)
+
     def test_what_fails_at_its_first_step_does_not_block_the_folder(self, tmp_path, monkeypatch):
         def fail(self):
             raise RuntimeError("at the first step")
@@ -212,6 +221,25 @@ class TestEvaluateAndPlot:
         assert cli.main([*argv, "--no-planning"]) == 0
         assert cli.main([*argv, "--adapt", "20"]) == 0
 
+    def test_adapts_from_the_experience_of_training(self, trained, tmp_path, capsys, monkeypatch):
+        known = []
+
+        def look(agent, *args, **kwargs):
+            known.append(agent.store.total)
+            return evaluate_pairs(agent, *args, **{**kwargs, "adapt_timesteps": 0})
+
+        monkeypatch.setattr(cli, "evaluate_pairs", look)
+        assert cli.main(["train", TOY, "--steps", "150", "--out", str(tmp_path)]) == 0
+        argv = ["evaluate", str(tmp_path / "agent.zip"), "--env", TOY, "--pairs", "1", "--adapt", "20"]
+        assert cli.main(argv) == 0
+        assert "without what it met" not in capsys.readouterr().out
+        (tmp_path / "experience.zip").unlink()
+        assert cli.main(argv) == 0
+        assert "without what it met in training: There is no file" in capsys.readouterr().out
+        assert cli.main(["evaluate", str(trained / "agent.zip"), *argv[2:]]) == 0
+        assert "without what it met in training: The stored replay buffer has n_envs=2" in capsys.readouterr().out
+        assert known == [150, 0, 0]
+
     def test_plot_leaves_two_pictures(self, trained, tmp_path):
         assert cli.main(["plot", str(trained / "agent.zip"), "--env", TOY, "--out", str(tmp_path)]) == 0
         assert {path.name for path in tmp_path.iterdir()} == {"skill_graph.png", "plan.png"}
@@ -220,7 +248,7 @@ class TestEvaluateAndPlot:
 def test_demo_leaves_everything(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(cli, "DEMO_ENV", TOY)
     assert cli.main(["demo", "--steps", "300", "--pairs", "3", "--out", str(tmp_path)]) == 0
-    expected = {"agent.zip", "progress.csv", "config.json", "results.json", "skill_graph.png", "plan.png"}
+    expected = {"agent.zip", "experience.zip", "progress.csv", "config.json", "results.json", "skill_graph.png", "plan.png"}
     assert {path.name for path in tmp_path.iterdir()} == expected
     results = json.loads((tmp_path / "results.json").read_text())
     assert list(results) == ["skill graph", "planning off", "random walk"]
