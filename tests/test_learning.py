@@ -1,12 +1,13 @@
 """The agent learns: on the NumPy maze, its zero-shot success is far above what no learning gives."""
 
+import copy
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from conftest import EAGER, SMALL, TOY, Recorder, check_store, new_agent, new_vec_env
+from conftest import EAGER, SMALL, TOY, Recorder, check_store, differences, new_agent, new_vec_env
 from gymnasium import spaces
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -19,7 +20,8 @@ from sb3_skillgraph import PAPER, OptionEnv, SkillGraphAgent
 from sb3_skillgraph.envs import MazeMap
 from sb3_skillgraph.evaluation import evaluate_pairs, run_pair
 from sb3_skillgraph.events import SalientEvent
-from sb3_skillgraph.options.learner import OptionTD3
+from sb3_skillgraph.options.factory import copy_policy
+from sb3_skillgraph.options.learner import OptionDDPG, OptionTD3
 
 ZIGZAG: MazeMap = [[1] * 7, [1, "r", 0, 0, 0, 0, 1], [1, 1, 1, 1, 1, 0, 1], [1, 0, 0, 0, 0, 0, 1], [1] * 7]
 
@@ -324,6 +326,25 @@ def test_option_env_goes_on_where_the_last_run_ended() -> None:
     env.reset(options={"start": [1.0, -1.0]})
     assert len(base.starts) == 4
     np.testing.assert_array_equal(base.starts[-1], [1.0, -1.0])
+
+
+@pytest.mark.parametrize("option_class", [OptionDDPG, OptionTD3, TD3, SAC])
+def test_an_option_that_copies_another_goes_on_learning_like_it(option_class: Any) -> None:
+    agent = new_agent(option_class=option_class).learn(800)
+    source = agent.global_option
+    assert source.learner.actor.optimizer.state_dict()["state"]
+    twins = [agent._factory.make(id, None, None) for id in ("one", "two")]
+    for twin in twins:
+        copy_policy(source, twin)
+    before = [copy.deepcopy(learner.get_parameters()) for learner in (source.learner, twins[1].learner)]
+    assert differences(*before) == []
+    observation = source.replay.sample(1).observations.numpy()
+    np.testing.assert_array_equal(source.actor.act(observation), twins[0].actor.act(observation))
+    steps = twins[0].learner.actor.optimizer.state_dict()["state"][0]["step"].item()
+    twins[0].learner.train(4, 64)
+    assert twins[0].learner.actor.optimizer.state_dict()["state"][0]["step"].item() > steps
+    # Nothing is shared: the source and the other copy are as they were.
+    assert differences([source.learner.get_parameters(), twins[1].learner.get_parameters()], before) == []
 
 
 def test_option_env_is_truncated_with_its_environment() -> None:

@@ -1,5 +1,6 @@
 """Building options: a headless SB3 model each, with a view of the shared store as its replay buffer."""
 
+import copy
 from typing import Any
 
 import numpy as np
@@ -111,13 +112,12 @@ class OptionFactory:
 
 
 def copy_policy(source: Option, target: Option) -> None:
-    """Give one option the policy and value function of another.
+    """Give one option the policy and value function of another, and what their optimisers know of them.
+
+    Optimisers that began anew would make their first steps as long as their learning rate allows, in every direction,
+    and a policy that was good would be worse for a while.
 
     :param source: the option copied from
     :param target: the option copied to
     """
-    with th.no_grad():
-        for theirs, ours in zip(
-            source.learner.policy.state_dict().values(), target.learner.policy.state_dict().values(), strict=True
-        ):
-            ours.copy_(theirs)
+    target.learner.set_parameters(copy.deepcopy(source.learner.get_parameters()))
