@@ -120,4 +120,5 @@ def copy_policy(source: Option, target: Option) -> None:
     :param source: the option copied from
     :param target: the option copied to
     """
-    target.learner.set_parameters(copy.deepcopy(source.learner.get_parameters()))
+    parameters: dict[str, Any] = copy.deepcopy(source.learner.get_parameters())
+    target.learner.set_parameters(parameters)
