@@ -2,6 +2,7 @@
 
 import copy
 import csv
+import itertools
 import warnings
 from typing import Any
 
@@ -27,8 +28,10 @@ PIT, DEPTH = np.array([0.0, 1.4]), 0.45  # beside the way from the toy maze's st
 class Pit(gym.Wrapper):
     """Whoever falls into it stays there, until the reset."""
 
+    center, depth = PIT, DEPTH
+
     def in_pit(self, observation: Any) -> bool:
-        return bool(np.linalg.norm(observation["achieved_goal"] - PIT) < DEPTH)
+        return bool(np.linalg.norm(observation["achieved_goal"] - self.center) < self.depth)
 
     def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
         observation, info = self.env.reset(**kwargs)
@@ -229,16 +232,31 @@ def test_a_picture_ends_where_the_agent_is_stuck(trained: SkillGraphAgent) -> No
     assert not trajectory.success
 
 
+def where_options_run(agent: SkillGraphAgent, start: np.ndarray, goal: np.ndarray) -> np.ndarray:
+    """Where an agent goes from a start to a goal while options of its graph are running, shape (n, 2)."""
+    env = gym.make(TOY, terminate_on_success=True)
+    observation, _ = env.reset(options={"start": start, "goal": goal})
+    state, over, points = None, False, []
+    while not over:
+        action, state, _ = agent.act(observation, state)
+        observation, _, terminated, truncated, _ = env.step(action)
+        over = terminated or truncated
+        if state.option[0] != GLOBAL:
+            points.append(observation["achieved_goal"])
+    return np.array(points).reshape(-1, 2)
+
+
 def test_a_fall_is_a_failure_of_the_option_that_ran(trained: SkillGraphAgent) -> None:
+    centers = [event.center for event in trained.events]
+    ways = [(a, b, where_options_run(trained, a, b)) for a, b in itertools.permutations(centers, 2)]
+    start, goal, way = max(ways, key=lambda each: len(each[2]))
+    assert len(way) > 5
     env = Pit(gym.make(TOY, terminate_on_success=True))
-    traces = []
-    for goal in ([1.0, 1.0], [1.0, -1.0]):
-        for x in np.linspace(-1.2, -DEPTH - 0.05, 12):  # on the way along the upper corridor
-            pair = run_pair(trained, env, np.array([x, 1.4]), np.array(goal), np.nan)
-            if pair.stuck and pair.trace is not None and pair.trace.planned_steps:
-                traces.append(pair.trace)
-    assert any(trace.n_runs > trace.n_successes for trace in traces)
-    assert not any(trace.followed for trace in traces)
+    env.center, env.depth = way[len(way) // 2], 0.01  # on the way of an option
+    pair = run_pair(trained, env, start, goal, np.nan)
+    assert pair.stuck and pair.trace is not None and pair.trace.planned_steps
+    assert pair.trace.n_runs > pair.trace.n_successes
+    assert not pair.trace.followed
 
 
 def test_getting_stuck_on_the_last_step_of_an_episode() -> None:
