@@ -312,6 +312,20 @@ def test_covering_options_learn_on_from_where_the_environment_stands(covering: C
     assert n_compared >= 2
 
 
+def test_a_copy_of_covering_options_leaves_them_alone(covering: CoveringOptions) -> None:
+    def known(learner: CoveringOptions) -> Any:
+        parameters = learner.model.get_parameters()
+        return parameters["policy"], parameters["policy.optimizer"]["state"]
+
+    before = copy.deepcopy(known(covering))
+    twin = covering.copy(AnyStart(toy(maze_map=CORRIDOR)))
+    twin.learn(40)
+    th.testing.assert_close(known(covering), before, rtol=0.0, atol=0.0)
+    for was, now in zip(before, known(twin), strict=True):
+        with pytest.raises(AssertionError):
+            th.testing.assert_close(now, was, rtol=0.0, atol=0.0)
+
+
 def test_learning_on_begins_a_new_trajectory() -> None:
     learner = CoveringOptions(toy(), n_options=1, option_updates=1, reach=10, seed=0).learn(150).learn(150)
     store, rows = learner.store, np.arange(299)

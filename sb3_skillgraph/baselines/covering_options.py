@@ -161,7 +161,7 @@ class CoveringOptions:
             copy_policy(option, twin.options[-1])
         if self.global_option is not None and twin.global_option is not None:
             copy_policy(self.global_option, twin.global_option)
-        twin.model.set_parameters(self.model.get_parameters())  # type: ignore[arg-type]
+        twin.model.set_parameters(copy.deepcopy(self.model.get_parameters()))  # type: ignore[arg-type]
         twin.model.replay_buffer = copy.deepcopy(self.model.replay_buffer)
         twin.model.num_timesteps = self.model.num_timesteps
         least = twin.model.exploration_final_eps
