@@ -74,6 +74,8 @@ def test_run(folder: pathlib.Path) -> dict[str, Any]:
     config = json.loads((folder / CONFIG).read_text())
     env = gym.make(config["env_id"], **{"terminate_on_success": True, **config["env_kwargs"]})
     saved = checkpoints(folder)
+    if not saved:
+        raise SystemExit(f"{folder} holds no checkpoint: name a run of sb3-skillgraph compare, which keeps its last one.")
     agent = load_agent(saved[max(saved)], env)
     geometry, margin = env.get_wrapper_attr("geometry"), env.get_wrapper_attr("body_radius")
     env.reset(seed=config["seed"])

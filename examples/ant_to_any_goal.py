@@ -4,7 +4,7 @@
     python examples/ant_to_any_goal.py runs/ant/agent.zip --goal -4 -4 --goal 4 0 --goal -4 4
 
 Training takes about 20 minutes. On a machine without a screen, set MUJOCO_GL=egl (without a GPU, EGL_PLATFORM=surfaceless,
-too) or MUJOCO_GL=osmesa for the film.
+too) for the film, or MUJOCO_GL=osmesa where the library OSMesa is installed.
 """
 
 import argparse
@@ -18,6 +18,7 @@ import torch as th
 from PIL import Image
 
 from sb3_skillgraph import SkillGraphAgent
+from sb3_skillgraph.console import assignment
 from sb3_skillgraph.envs.mujoco_mazes import MujocoMazeTask
 from sb3_skillgraph.plotting import Trajectory, plot_plan, save_figure
 
@@ -72,13 +73,16 @@ def walk(agent: SkillGraphAgent, env: gym.Env, observation: dict[str, Any], film
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
 parser.add_argument("agent", type=Path, help="a trained agent")
 parser.add_argument("--env", default="SkillGraph/AntUMaze-v0", help="where it was trained")
+parser.add_argument(
+    "--env-kwargs", type=assignment, nargs="+", default=[], metavar="NAME=VALUE", help="of that, as it was trained"
+)
 parser.add_argument("--goal", type=float, nargs=2, action="append", metavar=("X", "Y"), required=True, help="in metres")
 parser.add_argument("--out", type=Path, default=Path("runs/ant_to_any_goal"), help="folder for film and pictures")
 args = parser.parse_args()
 
 th.set_num_threads(1)
 try:
-    env = gym.make(args.env, terminate_on_success=True)
+    env = gym.make(args.env, terminate_on_success=True, **dict(args.env_kwargs))
     agent = SkillGraphAgent.load(args.agent, env=env)
     for goal in args.goal:
         observation, _ = env.reset(seed=0, options={"goal": goal})  # refuses walls
@@ -94,7 +98,7 @@ x_min, x_max, _, _ = geometry.extent
 try:
     film = Film(task.model, x_max - x_min)
 except (AttributeError, RuntimeError, mujoco.FatalError) as error:  # whichever comes of there being no screen
-    parser.error(f"MuJoCo cannot draw here ({error}): set MUJOCO_GL=egl or MUJOCO_GL=osmesa")
+    parser.error(f"MuJoCo cannot draw here ({error}): set MUJOCO_GL=egl")
 for number, goal in enumerate(np.array(args.goal)):
     observation = set_goal(env, observation, goal)
     film.shoot(task.data)

@@ -21,7 +21,7 @@ from filelock import FileLock
 from imageio.v3 import imread
 
 from sb3_skillgraph.cli import main
-from sb3_skillgraph.experiments import RunSpec, compare, load_plan, run, runner, status
+from sb3_skillgraph.experiments import RunSpec, compare, learners, load_plan, run, runner, status
 from sb3_skillgraph.experiments.figures import method_curves, practice_curves
 from sb3_skillgraph.experiments.summary import estimate, interquartile_mean
 from sb3_skillgraph.run_folder import checkpoints, read_progress
@@ -170,6 +170,19 @@ def test_what_is_done_is_not_taken_for_something_else(tmp_path: Path) -> None:
     assert status([other], tmp_path)[0].state == "other"
     assert method_curves([other], tmp_path) == {}
     assert status([spec("random_walk")], tmp_path)[0].state == "done"
+
+
+def test_a_run_with_other_recommended_settings_is_something_else(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    this = spec("planning_off")
+    assert run(this, tmp_path) == "done"
+    config = json.loads((this.folder(tmp_path) / "config.json").read_text())
+    assert config["resolved"].items() >= {**this.arguments, "policy": "MultiInputPolicy"}.items()
+    load = learners.load_hyperparams
+    monkeypatch.setattr(learners, "load_hyperparams", lambda env_id: {**load(env_id), "gamma": 0.5})
+    assert run(this, tmp_path) == "refused"
+    del config["resolved"]  # a run from before they were written down
+    (this.folder(tmp_path) / "config.json").write_text(json.dumps(config))
+    assert run(this, tmp_path) == "skipped"
 
 
 def die_once(spec: RunSpec, out: Path) -> str:

@@ -22,6 +22,7 @@ from sb3_skillgraph.evaluation import evaluate_pairs, run_pair
 from sb3_skillgraph.events import SalientEvent
 from sb3_skillgraph.options.factory import copy_policy
 from sb3_skillgraph.options.learner import OptionDDPG, OptionTD3
+from sb3_skillgraph.options.views import egocentric_view
 
 ZIGZAG: MazeMap = [[1] * 7, [1, "r", 0, 0, 0, 0, 1], [1, 1, 1, 1, 1, 0, 1], [1, 0, 0, 0, 0, 0, 1], [1] * 7]
 
@@ -292,6 +293,12 @@ def test_option_env_is_a_wrapper_with_a_flat_space() -> None:
     assert env.observation_space.contains(obs)
     assert info["can_start"]
     assert env.unwrapped is base.unwrapped
+
+
+def test_option_env_shows_what_it_is_told_to() -> None:
+    assert option_env(option_view="egocentric")[0].view.function is egocentric_view
+    with pytest.raises(ValueError, match="Unknown option_view 'nose'"):
+        option_env(option_view="nose")
 
 
 def test_option_env_pays_and_ends_by_the_option() -> None:

@@ -108,6 +108,16 @@ def test_where_a_run_began_is_not_to_blame(trained: SkillGraphAgent) -> None:
     assert chain.n_failures == n_failures + 3
 
 
+def test_an_option_that_hardly_ends_otherwise_is_planned_with_no_more(trained: SkillGraphAgent) -> None:
+    option = next(option for option in trained.options if option.mature and option.success_rate() > 0.5)
+    graph, initiation = trained.graph, copy.deepcopy(option.initiation.get_state())
+    while option.success_rate(graph.rate_prior) >= graph.min_success_rate:
+        assert graph.nx.has_edge(option.id, option.target)
+        trained.chaining.learn_stuck(option)
+    assert graph.nx.out_degree(option.id) == 0
+    assert differences(option.initiation.get_state(), initiation) == []
+
+
 def test_nothing_is_learned_of_ways_into_the_pit() -> None:
     agent = new_agent(pit_env()).learn(1500, log_interval=None)
     assert agent.curriculum.n_stuck > 3

@@ -46,9 +46,15 @@ def test_an_action_is_held_until_the_episode_is_over(kwargs: dict[str, int], exp
         assert info["action"].tolist() == [0.5]
 
 
-def test_an_action_is_held_for_a_step_at_least() -> None:
-    with pytest.raises(ValueError, match="n_steps must be at least 1, not 0"):
-        HoldAction(Counter(), 0)
+@pytest.mark.parametrize("n_steps", [0, 2.0, "2"])
+def test_an_action_is_held_for_a_step_at_least(n_steps: Any) -> None:
+    with pytest.raises(ValueError, match=f"n_steps must be a whole number of steps, at least 1, not {n_steps!r}"):
+        HoldAction(Counter(), n_steps)
+
+
+def test_what_an_environment_tells_of_being_stuck_stays() -> None:
+    env = TellStuck(Counter(stuck_at=2), lambda observation: bool(observation[0] == 3))
+    assert [env.step(np.zeros(1))[-1]["stuck"] for _ in range(4)] == [False, True, True, False]
 
 
 @pytest.fixture

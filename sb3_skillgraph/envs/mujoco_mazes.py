@@ -211,5 +211,8 @@ def make_geometry(maze_map: MazeMap | None, cell_size: float) -> MazeGeometry:
     :raises ValueError: when the map is missing or unusable
     """
     if maze_map is None:
-        raise ValueError("maze_map is required, for example maze_map=[[1, 1, 1, 1], [1, 'r', 0, 1], [1, 1, 1, 1]]")
+        raise ValueError(
+            "maze_map is required, for example maze_map=[[1, 1, 1, 1], [1, 'r', 0, 1], [1, 1, 1, 1]] "
+            "(on the command line in quotes, after --env-kwargs)"
+        )
     return MazeGeometry(maze_map, cell_size)

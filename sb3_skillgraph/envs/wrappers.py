@@ -15,13 +15,13 @@ class HoldAction(gym.Wrapper):
 
     :param env: any environment
     :param n_steps: steps of the wrapped environment in one step
-    :raises ValueError: if there is not one at least
+    :raises ValueError: if that is no whole number, or there is not one at least
     """
 
     def __init__(self, env: gym.Env, n_steps: int) -> None:
         super().__init__(env)
-        if n_steps < 1:
-            raise ValueError(f"n_steps must be at least 1, not {n_steps!r}.")
+        if not isinstance(n_steps, int | np.integer) or n_steps < 1:
+            raise ValueError(f"n_steps must be a whole number of steps, at least 1, not {n_steps!r}.")
         self.n_steps = n_steps
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
@@ -41,7 +41,7 @@ class HoldAction(gym.Wrapper):
 
 class TellStuck(gym.Wrapper):
     """
-    Tells in ``info["stuck"]`` when the agent can do nothing any more.
+    Tells in ``info["stuck"]`` when the agent can do nothing any more; where the environment tells so itself, that stays.
 
     :param env: any environment
     :param is_stuck: function of an observation, such as :func:`on_its_back`
@@ -58,7 +58,8 @@ class TellStuck(gym.Wrapper):
         :return: observation, reward, terminated, truncated and info
         """
         observation, reward, terminated, truncated, info = self.env.step(action)
-        return observation, reward, terminated, truncated, {**info, "stuck": bool(self.is_stuck(observation))}
+        stuck = bool(info.get("stuck")) or bool(self.is_stuck(observation))
+        return observation, reward, terminated, truncated, {**info, "stuck": stuck}
 
 
 def on_its_back(observation: dict[str, np.ndarray]) -> bool:

@@ -1,6 +1,7 @@
 """The commands ``compare``, ``status`` and ``figure``."""
 
 import argparse
+import sys
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -131,7 +132,8 @@ def _print_status(runs: list[RunStatus]) -> None:
         counts = (f"{states['done']}/{len(here)}", str(states["running"]), str(states["failed"]))
         steps = f"{sum(run.steps for run in here):,} of {sum(run.spec.steps for run in here):,}"
         table.add_row(environment, method, *counts, steps, success, " and ".join(left) or "-")
-    Console().print(table)
+    # Where nobody watches there is no width to keep to, and rich would take 80 columns.
+    Console(width=None if sys.stdout.isatty() else 200).print(table)
     others = sum(run.state == "other" for run in runs)
     if others:
         print(f"{others} in the place of which there is a run with other settings; they are left out")

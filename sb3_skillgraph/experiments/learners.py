@@ -53,6 +53,15 @@ class Learner(ABC):
         :raises ValueError: if there is one of which it has none
         """
 
+    @classmethod
+    def resolve(cls, env_id: str, arguments: dict[str, Any]) -> dict[str, Any]:
+        """Return the arguments the method gets: those of the plan, beside what is recommended for the environment.
+
+        :param env_id: id of the environment
+        :param arguments: as a plan gives them
+        """
+        return arguments
+
     @abstractmethod
     def learn(self, begin: int, end: int, every: int, check: Check) -> None:
         """Learn, and stop for a check every so often and at the end.
@@ -117,12 +126,17 @@ class SkillGraphLearner(Learner):
 
     def __init__(self, env_id: str, env_kwargs: dict[str, Any], seed: int, arguments: dict[str, Any]) -> None:
         self.env = gym.make(env_id, **env_kwargs)
-        self.agent = SkillGraphAgent(env=self.env, seed=seed, **_recommended(env_id, arguments))
+        self.agent = SkillGraphAgent(env=self.env, seed=seed, **self.resolve(env_id, arguments))
 
     @classmethod
     def check_arguments(cls, arguments: dict[str, Any], where: str) -> None:
         """They are those of the agent."""
         check_hyperparams(arguments, where)
+
+    @classmethod
+    def resolve(cls, env_id: str, arguments: dict[str, Any]) -> dict[str, Any]:
+        """Fill in what is recommended."""
+        return _recommended(env_id, arguments)
 
     @property
     def policy(self) -> Predictor:  # type: ignore[override]
@@ -276,13 +290,18 @@ class RecipeLearner(Learner):
 
     def __init__(self, env_id: str, env_kwargs: dict[str, Any], seed: int, arguments: dict[str, Any]) -> None:
         env = NewGoals(gym.make(env_id, **env_kwargs), GOAL_STEPS)
-        self.recipe = HindsightRecipe(env, seed=seed, **_recommended(env_id, arguments))
+        self.recipe = HindsightRecipe(env, seed=seed, **self.resolve(env_id, arguments))
         self.policy: SkillGraphAgent = self.recipe.agent
 
     @classmethod
     def check_arguments(cls, arguments: dict[str, Any], where: str) -> None:
         """They are those of the agent."""
         check_hyperparams(arguments, where)
+
+    @classmethod
+    def resolve(cls, env_id: str, arguments: dict[str, Any]) -> dict[str, Any]:
+        """Fill in what is recommended."""
+        return _recommended(env_id, arguments)
 
     def learn(self, begin: int, end: int, every: int, check: Check) -> None:
         """Learn in one go."""

@@ -132,7 +132,16 @@ def has_other_settings(spec: RunSpec, out: Path) -> bool:
         return False
     before = json.loads((folder / CONFIG).read_text())
     del before["versions"]
-    return bool(before != json.loads(json.dumps(spec.as_plain())))
+    now = json.loads(_settings(spec))
+    if "resolved" not in before:  # a run from before that was written down
+        del now["resolved"]
+    return bool(before != now)
+
+
+def _settings(spec: RunSpec) -> str:
+    """Return all that is set as JSON: what the plan says, and what is recommended where it is silent."""
+    resolved = ALGORITHMS[spec.algorithm].resolve(spec.env_id, spec.arguments)
+    return json.dumps({**spec.as_plain(), "resolved": resolved}, default=lambda item: item.__name__)
 
 
 def run(spec: RunSpec, out: Path) -> Outcome:
@@ -178,7 +187,8 @@ class _Run:
         self.learner = ALGORITHMS[spec.algorithm](spec.env_id, spec.env_kwargs, spec.seed, spec.arguments)
         begin = self._resume(self.learner)
         if not begin:
-            write_atomically(folder / CONFIG, json.dumps({**spec.as_plain(), "versions": versions()}, indent=1) + "\n")
+            document = {**json.loads(_settings(spec)), "versions": versions()}
+            write_atomically(folder / CONFIG, json.dumps(document, indent=1) + "\n")
         self._clock = time.perf_counter()
         if begin < spec.steps:
             self.learner.learn(begin, spec.steps, spec.check_every, self._check)

@@ -10,7 +10,7 @@ from sb3_skillgraph.events import SalientEvent
 from sb3_skillgraph.options.execution import Fate, fate
 from sb3_skillgraph.options.initiation import InitiationSet
 from sb3_skillgraph.options.option import Option, termination_rule
-from sb3_skillgraph.options.views import ScaledView, as_view
+from sb3_skillgraph.options.views import ScaledView, View, as_view
 
 
 class OptionEnv(gym.Wrapper):
@@ -27,7 +27,9 @@ class OptionEnv(gym.Wrapper):
     :param initiation: where the option can start; ``info["can_start"]`` tells after each reset whether it can
     :param timeout: environment steps per run
     :param goal: the point the policy aims at, shape ``(goal_dim,)``; by default that of the termination set
-    :raises ValueError: if the environment is no goal environment or the goal has the wrong shape
+    :param option_view: what the policy sees, as :class:`~sb3_skillgraph.SkillGraphAgent` takes it; by default what the
+        environment names as its ``option_view``, else ``"relative"``
+    :raises ValueError: if the environment is no goal environment, the goal has the wrong shape, or the view is unknown
     """
 
     def __init__(
@@ -38,6 +40,7 @@ class OptionEnv(gym.Wrapper):
         initiation: InitiationSet | None = None,
         timeout: int = 200,
         goal: np.ndarray | None = None,
+        option_view: str | View | None = None,
     ) -> None:
         super().__init__(env)
         space = env.observation_space
@@ -54,8 +57,9 @@ class OptionEnv(gym.Wrapper):
         self.goal = np.asarray(goal, dtype=np.float32)
         if self.goal.shape != space["achieved_goal"].shape:
             raise ValueError(f"The goal must have shape {space['achieved_goal'].shape}, not {self.goal.shape}.")
-        view = env.get_wrapper_attr("option_view") if env.has_wrapper_attr("option_view") else None
-        self.view = ScaledView(as_view(view), termination.radius)
+        if option_view is None and env.has_wrapper_attr("option_view"):
+            option_view = env.get_wrapper_attr("option_view")
+        self.view = ScaledView(as_view(option_view), termination.radius)
         self.rule = termination_rule(termination, termination.radius)
         dims = [int(np.prod(space[key].shape)) for key in ("observation", "achieved_goal")]  # type: ignore[arg-type]
         self.observation_space = spaces.Box(-np.inf, np.inf, (self.view.dim(*dims),), np.float32)
