@@ -59,7 +59,8 @@ def test_ant_to_any_goal(monkeypatch: Any, tmp_path: Path, capsys: Any) -> None:
     agent = SkillGraphAgent("MultiInputPolicy", gym.make("SkillGraph/AntUMaze-v0"), seed=0)
     agent.save(tmp_path / "agent.zip")
     goals = ["--goal", "-3.9", "4.1", "--goal", "-4", "-4"]  # at the start, and far away
-    run(monkeypatch, "ant_to_any_goal.py", tmp_path / "agent.zip", *goals, "--out", tmp_path / "out")
+    more = ["--out", tmp_path / "out", "--env-kwargs", "torque=30"]
+    run(monkeypatch, "ant_to_any_goal.py", tmp_path / "agent.zip", *goals, *more)
     out = capsys.readouterr().out
     assert "goal [-3.9, 4.1]: " in out and "steps, reached" in out
     assert "goal [-4.0, -4.0]: outside, " in out
