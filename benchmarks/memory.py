@@ -19,11 +19,11 @@ import torch as th
 from gymnasium import spaces
 
 from sb3_skillgraph import __version__
-from sb3_skillgraph.events import SalientEvent
+from sb3_skillgraph.events import Event
 from sb3_skillgraph.options.factory import OptionFactory
 from sb3_skillgraph.options.learner import OptionDDPG
 from sb3_skillgraph.options.views import ScaledView, relative_view
-from sb3_skillgraph.replay import TransitionStore
+from sb3_skillgraph.memory.replay import TransitionStore
 
 OBSERVATION_DIM, GOAL_DIM, ACTION_DIM = 27, 2, 8
 
@@ -55,7 +55,7 @@ def measure(n_options: int, n_transitions: int) -> dict[str, Any]:
     factory = OptionFactory(OptionDDPG, kwargs, store, view, action_space, 0.45, 0.2, rng, replay, th.device("cpu"))
     options = []
     for i in range(n_options):
-        option = factory.make(f"o{i + 1}", "e0", SalientEvent("e0", np.zeros(GOAL_DIM), 0.45))
+        option = factory.make(f"o{i + 1}", "e0", Event("e0", np.zeros(GOAL_DIM), 0.45))
         option.replay.add_rows(np.sort(rng.choice(n_transitions, min(100_000, n_transitions), replace=False)))
         option.learner.train(1, 128)
         options.append(option)

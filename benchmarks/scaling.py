@@ -28,7 +28,7 @@ from stable_baselines3.td3.policies import TD3Policy
 from sb3_skillgraph import SkillGraphAgent
 from sb3_skillgraph.chaining import SkillChain
 from sb3_skillgraph.controller import ControllerState, Request
-from sb3_skillgraph.events import SalientEvent
+from sb3_skillgraph.events import Event
 from sb3_skillgraph.options.initiation import Boundary
 from sb3_skillgraph.options.option import Option
 
@@ -106,7 +106,7 @@ class Plane:
         chaining, options = self.agent.chaining, list(self.agent.graph.options.values())
         option = options[self.rng.integers(len(options))]
         core = option.initiation.core
-        assert core is not None and isinstance(option.termination, SalientEvent)
+        assert core is not None and isinstance(option.termination, Event)
         start, end = core + self.rng.normal(0.0, 0.3 * RADIUS, 2), option.termination.center
         if self.rng.random() < 0.9:
             chaining.learn_success(option, np.linspace(start, end, 30), end)

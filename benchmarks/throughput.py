@@ -25,7 +25,7 @@ from stable_baselines3 import DDPG
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_skillgraph import SkillGraphAgent
-from sb3_skillgraph.events import SalientEvent
+from sb3_skillgraph.events import Event
 
 ENVS = {"point": "SkillGraph/PointMazeMedium-v0", "ant": "SkillGraph/AntUMaze-v0"}
 WARM_UP = 3_000  # random steps, in whose trajectories the graph is laid
@@ -108,7 +108,7 @@ def populate(agent: SkillGraphAgent, n_options: int) -> None:
     raise RuntimeError(f"The warm-up's trajectories gave only {len(agent.graph.options)} options: lengthen it.")
 
 
-def add_event(agent: SkillGraphAgent, point: np.ndarray) -> SalientEvent:
+def add_event(agent: SkillGraphAgent, point: np.ndarray) -> Event:
     """Add an event where none is yet."""
     added = agent.discovery.add(point)
     events = list(agent.graph.events.values())

@@ -2,20 +2,10 @@
 
 from sb3_skillgraph import envs  # registers the environments
 from sb3_skillgraph.agent import SkillGraphAgent
-from sb3_skillgraph.evaluation import evaluate_pairs
-from sb3_skillgraph.options.env import OptionEnv
-from sb3_skillgraph.paper import PAPER
-from sb3_skillgraph.smdp import GraphPolicy, OptionsEnv, SMDPQLearning
 from sb3_skillgraph.version import __version__
 
 __all__ = [
-    "PAPER",
-    "GraphPolicy",
-    "OptionEnv",
-    "OptionsEnv",
-    "SMDPQLearning",
     "SkillGraphAgent",
     "__version__",
     "envs",
-    "evaluate_pairs",
 ]

@@ -1,120 +1,92 @@
-"""The agent: an SB3 off-policy algorithm that discovers, plans, chains and learns (section 3, Figure 10)."""
+"""The agent: an SB3 off-policy algorithm that explores, learns to walk, and plans over what it has learned (section 3)."""
 
+import copy
+import io
+from collections.abc import Iterable
 from typing import Any, ClassVar, Literal, TypeVar
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.noise import ActionNoise, VectorizedActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.utils import check_for_correct_spaces, get_system_info
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 from stable_baselines3.td3.policies import MultiInputPolicy
 
-from sb3_skillgraph.controller import ControllerState, OptionOutcome, Request
-from sb3_skillgraph.goal_env import GoalSpec, as_batch, as_goal, refuse_vec_normalize
+from sb3_skillgraph import persistence
+from sb3_skillgraph.choices import Stance
+from sb3_skillgraph.events import Event
+from sb3_skillgraph.goal_env import GoalSpec, as_batch, as_goal, check_finite, refuse_vec_normalize, rows, with_terminal
 from sb3_skillgraph.interrupts import Interrupts
+from sb3_skillgraph.learning.episodes import Episodes
+from sb3_skillgraph.learning.salience import Salience
 from sb3_skillgraph.options.learner import OptionDDPG
 from sb3_skillgraph.options.views import View
-from sb3_skillgraph.planner import Plan
-from sb3_skillgraph.rollouts import Rollouts
-from sb3_skillgraph.salience.proposals import Salience
+from sb3_skillgraph.options.walk import Walk
+from sb3_skillgraph.parts import Parts
+from sb3_skillgraph.plan import Plan, describe
+from sb3_skillgraph.runner import Run, RunnerState
+from sb3_skillgraph.saving import PathOrFile, load_tree, save_tree
 from sb3_skillgraph.vec_env import LeanVecEnv
 
 SelfSkillGraphAgent = TypeVar("SelfSkillGraphAgent", bound="SkillGraphAgent")
 
 
-class SkillGraphAgent(Rollouts):
+class SkillGraphAgent(OffPolicyAlgorithm):
     """
-    Deep Skill Graphs (DSG): discovers salient events without reward, learns options that connect them, arranges both in
-    a graph and plans over it to goals never seen in training.
+    Deep Skill Graphs (DSG): discovers events without reward, learns options that lead from one to another, arranges both
+    in a graph and plans over it to goals never seen in training.
 
     Paper: Bagaria, Crowley, Lim, Konidaris, *Skill Discovery for Exploration and Planning using Deep Skill Graphs* (2020).
-    The defaults are what works best; ``SkillGraphAgent(..., **PAPER)`` is the paper as written.
+    Everything the agent can do is an option of one graph: most are *walks*, which share one goal-conditioned policy. A plan
+    is a path of that graph, and :meth:`predict` runs the first option of what :meth:`plan` returns.
 
     :param policy: ``"MultiInputPolicy"`` (goal environments have Dict observations)
     :param env: a goal environment with Box actions, a VecEnv of such, or the id of one
     :param learning_rate: learning rate of actor and critic; ``option_kwargs`` can give the two apart
-    :param buffer_size: transitions kept in the store that all options share
+    :param buffer_size: transitions kept
     :param learning_starts: environment steps of random actions, without learning, at the start
     :param batch_size: transitions in a minibatch
     :param tau: soft update coefficient of the target networks
     :param gamma: discount factor
     :param train_freq: environment steps between updates
-    :param gradient_steps: minibatch updates, over all networks together, per ``train_freq`` steps
-    :param action_noise: SB3 action noise; by default Gaussian noise of ``exploration_noise``
-    :param replay_buffer_class: refused: options learn from one shared store
-    :param replay_buffer_kwargs: refused
-    :param optimize_memory_usage: refused
-    :param n_steps: refused unless 1
+    :param gradient_steps: minibatch updates per ``train_freq`` steps
+    :param action_noise: SB3 action noise; by default Gaussian noise of 0.1, in units of the scaled action
     :param stats_window_size: episodes over which SB3's rollout statistics are averaged
     :param tensorboard_log: folder of the TensorBoard log
-    :param policy_kwargs: keyword arguments of every option's policy; ``net_arch`` is ``[128, 128]`` unless given
+    :param policy_kwargs: keyword arguments of the walker's policy; ``net_arch`` is ``[128, 128]`` unless given
     :param verbose: 0 for silence, 1 for the progress table
     :param seed: seed of all generators
     :param device: torch device
     :param _init_setup_model: whether to build the networks at construction
-    :param use_sde: refused
-    :param option_class: SB3 off-policy class of the options' policies
+    :param option_class: SB3 off-policy class of the walker, or its name: ``OptionDDPG``, ``OptionTD3``, ``DDPG``, ``TD3``,
+        ``SAC``
     :param option_kwargs: further keyword arguments for it
     :param option_view: what a policy sees of (observation, achieved goal, goal): ``"relative"`` (all, and the goal
         relative to where the agent stands), ``"egocentric"`` (without absolute position), ``"body"`` (from a robot's body),
         ``"placed_body"`` (and where that is) or a function; None takes the one the environment names in its attribute
         ``option_view``, else ``"relative"``
-    :param option_timeout: environment steps an option may run [A.6]
-    :param stall_steps: environment steps after which a run counts as failed that stands still, and the next one begins with a
-        random action; None for never
-    :param event_radius: radius of salient events, in goal units; None takes the environment's ``success_radius`` or
+    :param event_radius: radius of events, in goal units; None takes the environment's ``success_radius`` or
         ``distance_threshold``
-    :param gestation_period: successes after which an option is mature
-    :param practice_runs: successful runs of its own that an option needs before its chain counts as complete
-    :param warm_start: gestating options act with the global option's policy and copy it when they mature; False lets
-        them learn from scratch
-    :param global_update_fraction: share of the updates that goes to the global option; executed options share the rest
-        (which the global option takes too while none of them is to be trained)
-    :param saturation_penalty: weight, in the loss of ``OptionDDPG``'s and ``OptionTD3``'s actors, of the mean squared
-        norm of what their tanh is given: keeps them from getting stuck at the bounds of the actions
-    :param shaping: reward for every event radius of distance gained, beside -1 a step; 0 for none [2.1]
-    :param hindsight: share of sampled transitions relabelled with a goal achieved later
-    :param doomed_steps: environment steps before the agent got stuck in which none are relabelled
-    :param goal_tolerance: how near the global option must come to a goal, and any option to one put in by hindsight, for
-        it to learn that it has reached it; in event radii, 1 at most
-    :param shared_experience: share of an option's batches drawn from all experience rather than its own runs
-    :param salience: how events are proposed: ``"frontier"`` (visited states), ``"rrt"`` (uniform feasible states from
-        the environment's ``sample_free``), ``"dco"`` (the two ends of a learned Fiedler vector) or an object with
-        ``propose(rng)`` [3.2.1]
-    :param salient_event_freq: K: episodes since the last accepted event after which new ones are sought [A.1.2]
-    :param retry_after: R: episodes to wait after an attempt that yielded none [A.1.2]
-    :param events_per_attempt: events sought per attempt [A.1.2: a pair]; None for 1, or 2 with ``"dco"``
-    :param event_tries: proposals drawn per event until one is not redundant [A.1.1]
-    :param event_reach: environment steps that a ``frontier`` event lies at most beyond the last event on its trajectory
-    :param max_unconnected: no events are sought while the chains that join so many are still open; None for no limit
-    :param target_choice: ``"nearest"`` (the open chain whose source is cheapest to reach, the way back included) or
-        ``"uniform"`` (any event [3.2.2])
-    :param explore_prob: probability that a mission explores: to the event nearest to a random point, and beyond
+    :param max_events: events that the graph may have; where more are needed they come to lie further apart
+    :param walk_steps: environment steps within which a trajectory that goes from one event to another makes an edge
+    :param salience: how events to pursue are proposed: ``"frontier"`` (uniform points around what has been visited),
+        ``"rrt"`` (uniform feasible states from the environment's ``sample_free``), ``"dco"`` (the two ends of a learned
+        Fiedler vector) or an object with ``propose(rng)`` [3.2.1]
+    :param explore_prob: probability that a mission explores: to the event nearest to a proposed point, and on from there;
+        the others travel to any event
     :param exploration_steps: environment steps of such an exploration
-    :param explore_beyond: event radii that an exploration towards a random point goes on past it; half of the explorations
-        are random walks instead
-    :param practise_prob: probability that a mission goes to an event that a path leads to
-    :param practise: which one: ``"least_tried"`` (whose last step on the path has run least often) or ``"random"``
-    :param max_tries: timed-out options after which a mission is given up
-    :param max_failures: failed options in a row after which a chain is given up; None for never
-    :param link_reach: a crossing between two events in at most so many steps opens a chain between them; 0 for never
-    :param prune_after: episodes after which a chain is let go that no plan has used meanwhile; None for never
-    :param off_policy_runs: whether any crossing between a chain's events counts for its gestating root
-    :param containment: share of recent samples of an effect set that must lie in an initiation set for an edge; 1.0 is
-        strict [3.2.6]
-    :param evidence_edges: whether successful runs begun in an event make an edge too
-    :param rate_prior: pseudo-counts of successes and of failures in success rates [A.2: none]
-    :param min_success_rate: success rate below which an edge is dropped
-    :param failure_cost: cost of a failed run in a plan, in successful ones [A.2: 1, which makes a weight 1 / success rate]
-    :param nearest: vertex nearest to a goal: by ``"steps"`` along trajectories or ``"euclidean"`` distance [3.2.3]
-    :param exploration_noise: standard deviation of Gaussian action noise, in units of the scaled action
-    :param random_action_prob: probability of a uniformly random action
-    :param random_hold: a random action is held for so many steps in the mean
-    :raises ValueError: if the environment is no goal environment with Box actions, or an argument is refused
+    :param explore_beyond: event radii that an exploration towards a point goes on past it
+    :param random_action_prob: share of the steps on the way that are random
+    :param hindsight: share of sampled transitions relabelled with a goal achieved later
+    :param goal_tolerance: how near to its goal the walker must learn to come, in event radii, 1 at most
+    :param shaping: reward for every event radius of distance gained, beside -1 a step; 0 for none [2.1]
+    :raises ValueError: if the environment is no goal environment with Box actions, or an argument is out of range
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MultiInputPolicy": MultiInputPolicy}
@@ -132,10 +104,6 @@ class SkillGraphAgent(Rollouts):
         train_freq: int | tuple[int, str] = 2,
         gradient_steps: int = 1,
         action_noise: ActionNoise | None = None,
-        replay_buffer_class: type[ReplayBuffer] | None = None,
-        replay_buffer_kwargs: dict[str, Any] | None = None,
-        optimize_memory_usage: bool = False,
-        n_steps: int = 1,
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
         policy_kwargs: dict[str, Any] | None = None,
@@ -144,54 +112,23 @@ class SkillGraphAgent(Rollouts):
         device: th.device | str = "auto",
         _init_setup_model: bool = True,
         *,
-        use_sde: bool = False,
-        option_class: type[OffPolicyAlgorithm] = OptionDDPG,
+        option_class: type[OffPolicyAlgorithm] | str = OptionDDPG,
         option_kwargs: dict[str, Any] | None = None,
         option_view: str | View | None = None,
-        option_timeout: int = 200,
-        stall_steps: int | None = 40,
         event_radius: float | None = None,
-        gestation_period: int = 1,
-        practice_runs: int = 2,
-        warm_start: bool = True,
-        global_update_fraction: float = 0.5,
-        saturation_penalty: float = 1e-4,
-        shaping: float = 0.0,
-        hindsight: float = 0.8,
-        doomed_steps: int = 50,
-        goal_tolerance: float = 0.5,
-        shared_experience: float = 0.5,
+        max_events: int = 500,
+        walk_steps: int = 40,
         salience: Literal["frontier", "rrt", "dco"] | Salience = "frontier",
-        salient_event_freq: int = 30,
-        retry_after: int = 1,
-        events_per_attempt: int | None = None,
-        event_tries: int = 20,
-        event_reach: int = 60,
-        max_unconnected: int | None = 5,
-        target_choice: Literal["nearest", "uniform"] = "nearest",
-        explore_prob: float = 0.2,
+        explore_prob: float = 0.5,
         exploration_steps: int = 100,
         explore_beyond: float = 0.0,
-        practise_prob: float = 0.2,
-        practise: Literal["least_tried", "random"] = "least_tried",
-        max_tries: int = 3,
-        max_failures: int | None = 12,
-        link_reach: int = 100,
-        prune_after: int | None = 50,
-        off_policy_runs: bool = True,
-        containment: float = 0.9,
-        evidence_edges: bool = True,
-        rate_prior: tuple[float, float] = (1.9, 0.1),
-        min_success_rate: float = 0.3,
-        failure_cost: float = 5.0,
-        nearest: Literal["steps", "euclidean"] = "steps",
-        exploration_noise: float = 0.1,
         random_action_prob: float = 0.1,
-        random_hold: int = 10,
+        hindsight: float = 0.8,
+        goal_tolerance: float = 0.5,
+        shaping: float = 0.0,
     ) -> None:
         # The keyword arguments as given: what is saved, and what load() builds the agent from.
         self._arguments = {k: v for k, v in locals().items() if k not in ("self", "env", "_init_setup_model", "__class__")}
-        _refuse(replay_buffer_class, replay_buffer_kwargs, optimize_memory_usage, n_steps, use_sde)
         if isinstance(policy, str) and policy not in self.policy_aliases:
             raise ValueError(f"Unknown policy {policy!r}: goal environments have Dict observations, use 'MultiInputPolicy'.")
         refuse_vec_normalize(env)
@@ -218,15 +155,16 @@ class SkillGraphAgent(Rollouts):
             sde_support=False,
             support_multi_env=True,
         )
-        self._exploration_noise = exploration_noise
-        self._random_action_prob = random_action_prob
-        self._random_hold = random_hold
-        self._reset_options: dict[str, Any] = {}  # while adapting: where episodes start
         self._interrupts = Interrupts()
+        self._env_snapshot: dict[str, Any] | None = None
+        self._loaded = False
         if self.env is not None:
             self._spec = GoalSpec.of(self.observation_space, self.action_space)
         if _init_setup_model:
             self._setup_model()
+
+    def __repr__(self) -> str:
+        return f"<SkillGraphAgent after {self.num_timesteps} steps: {self.graph}>"
 
     @staticmethod
     def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
@@ -234,6 +172,40 @@ class SkillGraphAgent(Rollouts):
         if type(wrapped) is DummyVecEnv and wrapped is not env and isinstance(wrapped.observation_space, spaces.Dict):
             return LeanVecEnv(wrapped.envs)
         return wrapped
+
+    def _setup_model(self) -> None:
+        self._setup_lr_schedule()
+        self.set_random_seed(self.seed)
+        self._convert_train_freq()
+        self._spec = GoalSpec.of(self.observation_space, self.action_space)
+        self.parts = Parts.build(self, self._spec, self._arguments)
+        # Under SB3's names as well: CheckpointCallback looks for the one, users for the other.
+        self.replay_buffer = self.parts.store  # type: ignore[assignment]
+        self.policy = self.parts.walker.learner.policy
+        self.episodes = Episodes(self)
+
+    # -- what it knows ------------------------------------------------------------------------------------------------
+
+    @property
+    def graph(self) -> Any:
+        """The skill graph, a :class:`~sb3_skillgraph.graph.SkillGraph`."""
+        return self.parts.graph
+
+    @property
+    def events(self) -> list[Event]:
+        """All events in the order of their discovery."""
+        return list(self.graph.events)
+
+    @property
+    def options(self) -> list[Walk]:
+        """All options of the graph: the walks, one to each event. They share their SB3 model, ``option.learner``."""
+        learner = self.parts.walker.learner
+        return [Walk(id, event, learner) for id, event in zip(self.graph.walk_ids, self.graph.events, strict=True)]
+
+    @property
+    def event_radius(self) -> float:
+        """Radius of the events, in goal units."""
+        return float(self.graph.radius)
 
     # -- learning -----------------------------------------------------------------------------------------------------
 
@@ -262,30 +234,116 @@ class SkillGraphAgent(Rollouts):
         with self._interrupts.watched():
             return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)  # type: ignore[arg-type]
 
+    def _setup_learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        reset_num_timesteps: bool = True,
+        tb_log_name: str = "run",
+        progress_bar: bool = False,
+    ) -> tuple[int, BaseCallback]:
+        rollout = self.parts.rollout
+        if not reset_num_timesteps:
+            # A call may overshoot by part of a roll-out; two calls of N then still end where one of 2N does.
+            total_timesteps -= max(0, min(self.num_timesteps - self._total_timesteps, self.n_envs * self._chunk()))
+        if rollout.pending is not None:  # the last call ended between a step and its storing: that step never was
+            self.parts.rng.bit_generator.state = rollout.pending.rng_state
+            self._last_obs = None
+        resumed = not reset_num_timesteps and persistence.restore_env(self)
+        self._env_snapshot = None
+        goes_on = resumed or (not reset_num_timesteps and self._last_obs is not None)
+        noise = copy.deepcopy(self.action_noise) if goes_on else None
+        total, callback = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
+        if noise is not None:
+            self.action_noise = noise  # SB3 resets it at every call
+        if not goes_on:
+            first, self._last_obs = self._last_obs, None
+            assert isinstance(first, dict)
+            check_finite(first, self.num_timesteps)
+            self._last_obs = first
+            rollout.begin_anew(rows(first, "achieved_goal"))
+        return total, callback
+
+    def _chunk(self) -> int:
+        return self.train_freq.frequency if self.train_freq.unit.value == "step" else 0  # type: ignore[union-attr]
+
+    def _sample_action(
+        self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Let the running options act, with noise; nothing is kept until the step is stored."""
+        assert isinstance(self._last_obs, dict)
+        observation = {key: rows(self._last_obs, key) for key in ("observation", "achieved_goal")}
+        scaled = self.parts.rollout.act(observation, self.num_timesteps < self.learning_starts, action_noise)
+        return self._unscale(scaled), scaled
+
+    def _unscale(self, scaled: np.ndarray) -> np.ndarray:
+        return self.parts.unscale(scaled).reshape((len(scaled), *self.action_space.shape))  # type: ignore[misc]
+
+    def _store_transition(
+        self,
+        replay_buffer: ReplayBuffer,
+        buffer_action: np.ndarray,
+        new_obs: np.ndarray | dict[str, np.ndarray],
+        reward: np.ndarray,
+        dones: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        """Store the step once, and let everything learn from it."""
+        assert isinstance(new_obs, dict)
+        stuck = np.array([bool(info.get("stuck")) for info in infos])
+        terminated = self.episodes.terminated(dones, infos)
+        new_obs = self.episodes.start_over(new_obs, dones, stuck, infos)
+        reached = with_terminal(new_obs, dones, infos)
+        check_finite(new_obs, self.num_timesteps)
+        if reached is not new_obs:
+            check_finite(reached, self.num_timesteps)
+        with self._interrupts:
+            observations = {key: rows(reached, key) for key in ("observation", "achieved_goal")}
+            self.parts.rollout.observe(observations, terminated, dones, stuck)
+            for i in np.flatnonzero(dones).tolist():
+                self.parts.rollout.begin_episode(i, rows(new_obs, "achieved_goal")[i])
+            self._last_obs = new_obs
+
+    def train(self, gradient_steps: int, batch_size: int = 100) -> None:
+        """
+        Do minibatch updates of the walker.
+
+        :param gradient_steps: number of updates
+        :param batch_size: transitions in a minibatch
+        """
+        if len(self.parts.store) < batch_size:
+            return  # loaded without its replay buffer: first gather some experience
+        learner = self.parts.walker.learner
+        learner._current_progress_remaining = self._current_progress_remaining
+        learner.train(gradient_steps, batch_size)
+        self._n_updates += gradient_steps
+        self.graph.now = float(self._n_updates)  # records age as the walker learns
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        for name, value in learner.logger.name_to_value.items():
+            if name != "train/n_updates":
+                self.logger.record(name, value)
+
     def dump_logs(self) -> None:
         """Write SB3's log entry, and the state of the graph under ``skillgraph/``."""
         for name, value in self.graph_summary().items():
             self.logger.record(f"skillgraph/{name}", value)
-        self.logger.record("skillgraph/rejected_events", self.discovery.n_rejected)
         super().dump_logs()
 
     def graph_summary(self) -> dict[str, float]:
         """Describe the graph in numbers.
 
-        :return: ``events``; ``options`` (mature) and ``edges``; ``joined_pairs``, the share of ordered event pairs
-            joined by a path; ``coverage``, the share of visited states from which some vertex can be entered;
-            ``success_rate``, the mean over the options; ``stuck``, episodes given up since the agent was stuck
+        :return: ``events``, ``salient_events`` among them and ``edges``; ``tried_edges``, of which a run is known;
+            ``success_rate`` of those, by runs; ``stuck``, episodes given up since the agent was stuck
         """
-        options = list(self.graph.options.values())
-        rates = [option.success_rate(self.graph.rate_prior) for option in options]
+        edges = self.graph.edges
+        runs = float((edges.successes + edges.failures).sum())
         return {
             "events": len(self.graph.events),
-            "options": len(options),
-            "edges": self.graph.nx.number_of_edges(),
-            "joined_pairs": self.graph.joined_pairs(),
-            "coverage": self.planner.coverage(),
-            "success_rate": float(np.mean(rates)) if rates else 0.0,
-            "stuck": self.curriculum.n_stuck,
+            "salient_events": sum(event.salient for event in self.graph.events),
+            "edges": edges.size,
+            "tried_edges": int(np.count_nonzero(edges.successes + edges.failures)),
+            "success_rate": float(edges.successes.sum()) / runs if runs else 0.0,
+            "stuck": self.parts.rollout.n_stuck,
         }
 
     # -- acting -------------------------------------------------------------------------------------------------------
@@ -298,13 +356,14 @@ class SkillGraphAgent(Rollouts):
         deterministic: bool = False,
     ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
         """
-        Act towards ``observation["desired_goal"]``: over the graph where a path leads, else along a way walked before.
+        Act towards ``observation["desired_goal"]``: run the first option of what :meth:`plan` returns, and plan anew when it
+        has ended.
 
-        Pass the returned state back in, as with SB3's recurrent policies: it holds the running option. Without it an
-        option is chosen anew at every step, which still makes progress but plans a thousand times.
+        Pass the returned state back in, as with SB3's recurrent policies: it holds the running option and what has
+        happened in the episode. Without it the agent plans at every step, and learns nothing from what has just failed.
 
         :param observation: one Dict observation, or a batch with a leading axis
-        :param state: what the last call returned; arrays of shape ``(n_envs,)``
+        :param state: what the last call returned; see :class:`~sb3_skillgraph.runner.RunnerState`
         :param episode_start: where an episode begins, and the state is forgotten; shape ``(n_envs,)``
         :param deterministic: not used: no noise is added either way
         :return: actions in the environment's own bounds, and the state
@@ -318,39 +377,54 @@ class SkillGraphAgent(Rollouts):
         observation: np.ndarray | dict[str, np.ndarray],
         state: tuple[np.ndarray, ...] | None = None,
         episode_start: np.ndarray | None = None,
-    ) -> tuple[np.ndarray, ControllerState, list[OptionOutcome]]:
+    ) -> tuple[np.ndarray, RunnerState, list[Run]]:
         """
         Act as :meth:`predict` does, and tell which options have ended.
 
         :param observation: one Dict observation, or a batch with a leading axis
-        :param state: what the last call returned; arrays of shape ``(n_envs,)``
+        :param state: what the last call returned
         :param episode_start: where an episode begins, and the state is forgotten; shape ``(n_envs,)``
-        :return: actions in the environment's own bounds, the state, and one outcome for each option that has ended
+        :return: actions in the environment's own bounds, the state, and one run for each option that has ended
         :raises ValueError: if the observation does not fit the observation space
         """
         batch, vectorized = as_batch(observation, self.observation_space)
-        n_envs = len(batch["achieved_goal"])
-        running = ControllerState.fresh(n_envs) if state is None else ControllerState(*state)
+        running = self._running_state(len(batch["achieved_goal"]), state)
         if episode_start is not None and np.any(episode_start):
             running = running.begun_anew(np.asarray(episode_start, dtype=bool))
-        requests = [Request(goal) for goal in batch["desired_goal"]]
-        running, outcomes = self.controller.advance(running, batch["achieved_goal"], requests)
-        scaled, _, running = self.controller.act(batch, running, requests)
-        actions = self._factory.unscale(scaled).reshape((n_envs, *self._action_space().shape))
-        return (actions if vectorized else actions[0]), running, outcomes
+        running, runs = self.parts.runner.advance(running, batch["achieved_goal"])
+        scaled, running = self.parts.runner.act(batch, batch["desired_goal"], running)
+        actions = self._unscale(scaled)
+        return (actions if vectorized else actions[0]), running, runs
 
-    def plan(self, obs: dict[str, np.ndarray], goal: np.ndarray | None = None) -> Plan:
+    def _running_state(self, n_envs: int, state: tuple[np.ndarray, ...] | None) -> RunnerState:
+        return RunnerState.fresh(n_envs, self._spec.goal_dim) if state is None else RunnerState(*state)
+
+    def running(self, state: tuple[np.ndarray, ...]) -> list[str]:
         """
-        Tell how the agent would go about a goal (section 3.3, Figure 2).
+        Tell which options run.
+
+        :param state: what :meth:`predict` returned
+        :return: the option's id for each environment
+        """
+        return [str(option) for option in RunnerState(*state).option]
+
+    def plan(
+        self, obs: dict[str, np.ndarray], goal: np.ndarray | None = None, state: tuple[np.ndarray, ...] | None = None
+    ) -> Plan:
+        """
+        Tell how the agent goes about a goal (section 3.3, Figure 2): what :meth:`predict` would do next, and what then.
 
         :param obs: one observation
         :param goal: the goal, shape ``(goal_dim,)``; by default ``obs["desired_goal"]``
-        :return: which of the paper's three cases holds, and the path
+        :param state: what the last :meth:`predict` returned; None at the start of an episode
+        :return: which of the paper's three cases holds, the path, and what it promises
         :raises ValueError: if the goal is not a finite vector of goal space
         """
         batch, _ = as_batch(obs, self.observation_space)
         target = batch["desired_goal"][0] if goal is None else as_goal(goal, self._spec.goal_dim)
-        return self.planner.plan(batch["achieved_goal"][0], target, self.event_radius)
+        running = self._running_state(1, state)
+        running, _ = self.parts.runner.advance(running, batch["achieved_goal"])
+        return describe(self.parts.runner, running, batch["achieved_goal"][0], target.astype(np.float32), Stance.PESSIMISTIC)
 
     def adapt(
         self: SelfSkillGraphAgent,
@@ -363,8 +437,7 @@ class SkillGraphAgent(Rollouts):
         """
         Learn to reach a goal the graph does not reach yet (section 3.3, cases b and c).
 
-        The goal becomes a salient event, joined to the vertex nearest to it by a chain whose options start from what
-        is known already; for ``total_timesteps`` the agent pursues nothing else.
+        For ``total_timesteps`` the agent pursues nothing else: it goes there, or looks for a way from the event nearest to it.
 
         :param goal: shape ``(goal_dim,)``
         :param start: where episodes begin meanwhile, for environments whose ``reset`` takes ``options={"start": ...}``
@@ -375,28 +448,158 @@ class SkillGraphAgent(Rollouts):
         """
         target = as_goal(goal, self._spec.goal_dim)
         assert self.env is not None, "Give the agent an environment (set_env) before adapt."
-        self._reset_options = {} if start is None else {"start": as_goal(start, self._spec.goal_dim)}
+        self.episodes.reset_options = {} if start is None else {"start": as_goal(start, self._spec.goal_dim)}
         self._last_obs, self._env_snapshot = None, None
         try:
-            self.env.set_options(self._reset_options)
-            self.curriculum.pin(target)
+            self.env.set_options(self.episodes.reset_options)
+            self.parts.missions.pinned = target
             return self.learn(total_timesteps, callback, log_interval=None, reset_num_timesteps=False)
         finally:
-            self.curriculum.unpin()
+            self.parts.missions.pinned = None
             self.env.set_options()
-            self._reset_options, self._last_obs = {}, None
+            self.episodes.reset_options, self._last_obs = {}, None
 
+    # -- saving and loading -------------------------------------------------------------------------------------------
 
-def _refuse(
-    replay_buffer_class: Any, replay_buffer_kwargs: Any, optimize_memory_usage: bool, n_steps: int, use_sde: bool
-) -> None:
-    reasons = {
-        "replay_buffer_class": (replay_buffer_class is not None, "all options learn from views of one shared store"),
-        "replay_buffer_kwargs": (bool(replay_buffer_kwargs), "all options learn from views of one shared store"),
-        "optimize_memory_usage": (optimize_memory_usage, "the shared store is as small as it can be"),
-        "n_steps": (n_steps != 1, "rewards are recomputed per option, one step at a time"),
-        "use_sde": (use_sde, "options explore with action noise"),
-    }
-    for name, (given, reason) in reasons.items():
-        if given:
-            raise ValueError(f"SkillGraphAgent does not take {name}: {reason}.")
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        return self.parts.walker.learner._get_torch_save_params()
+
+    def get_parameters(self) -> dict[str, Any]:
+        """
+        Return the parameters of the walker's networks and optimisers, under SB3's names.
+
+        :return: state dicts by name: ``"policy"``, ``"actor.optimizer"``, ...; tensors that belong to no network (SAC's
+            entropy coefficient) as SB3 names them
+        """
+        return self.parts.walker.learner.get_parameters()
+
+    def set_parameters(
+        self, load_path_or_dict: str | dict[str, Any], exact_match: bool = True, device: th.device | str = "auto"
+    ) -> None:
+        """
+        Set the parameters of the walker's networks and optimisers.
+
+        :param load_path_or_dict: what :meth:`get_parameters` returned, or the path of a saved agent
+        :param exact_match: whether every parameter must be given
+        :param device: torch device on which a file is loaded
+        :raises ValueError: if a name is unknown, or missing although ``exact_match``; if a file cannot be read
+        :raises RuntimeError: if the tensors do not fit
+        """
+        given = load_path_or_dict
+        if not isinstance(given, dict):
+            given = load_tree(given, "agent")["parameters"]
+        self.parts.walker.learner.set_parameters(given, exact_match, device)
+
+    def save(
+        self, path: PathOrFile, exclude: Iterable[str] | None = None, include: Iterable[str] | None = None
+    ) -> None:
+        """
+        Save everything but the replay buffer to one zip of JSON and ``.npy`` members.
+
+        The environments' states are saved too, if they can tell them (``get_state``), so that learning can go on
+        exactly where it was.
+
+        :param path: path (``.zip`` is added if it has no ending) or binary file object
+        :param exclude: names of constructor arguments not to save; loading then takes their defaults
+        :param include: names to save even if excluded
+        :raises OSError: if the file cannot be written; an old file of that name is then untouched
+        """
+        save_tree(path, "agent", persistence.agent_tree(self, set(exclude or ()) - set(include or ())))
+
+    def save_replay_buffer(self, path: PathOrFile) -> None:
+        """
+        Save the filled rows of the replay buffer.
+
+        :param path: path (``.zip`` is added if it has no ending) or binary file object
+        :raises OSError: if the file cannot be written; an old file of that name is then untouched
+        """
+        save_tree(path, "replay_buffer", self.parts.store.get_state())
+
+    def load_replay_buffer(self, path: PathOrFile, truncate_last_traj: bool = True) -> None:
+        """
+        Load what :meth:`save_replay_buffer` saved.
+
+        :param path: path or binary file object
+        :param truncate_last_traj: not used: trajectories are kept apart whatever follows
+        :raises ValueError: if the file is damaged or holds something else, or does not fit this agent
+        """
+        self.parts.store.set_state(load_tree(path, "replay_buffer"))
+
+    @classmethod
+    def load(
+        cls: type[SelfSkillGraphAgent],
+        path: PathOrFile,
+        env: GymEnv | None = None,
+        device: th.device | str = "auto",
+        custom_objects: dict[str, Any] | None = None,
+        print_system_info: bool = False,
+        force_reset: bool = False,
+        **kwargs: Any,
+    ) -> SelfSkillGraphAgent:
+        """
+        Load an agent; nothing in the file is ever executed.
+
+        :param path: path (with or without ``.zip``) or binary file object
+        :param env: environment to go on with; None to only predict
+        :param device: torch device
+        :param custom_objects: arguments to use in place of the saved ones
+        :param print_system_info: print the versions of this system's libraries
+        :param force_reset: begin ``learn`` at a fresh episode even if the environments' states were saved (SB3's default
+            is to do so; here learning goes on exactly where it was)
+        :param kwargs: arguments to use in place of the saved ones
+        :return: the agent
+        :raises ValueError: if the file is damaged, of another schema or no agent at all; if the environment does not fit;
+            if the agent was made with a function that must be given again
+        :raises TypeError: if there is no such argument
+        """
+        if print_system_info:
+            get_system_info()
+        tree = load_tree(path, "agent")
+        arguments = {"policy": "MultiInputPolicy", **tree["arguments"], "device": device, **(custom_objects or {}), **kwargs}
+        persistence.require_callables(arguments)
+        agent = cls(env=None, _init_setup_model=False, **arguments)
+        agent.observation_space = persistence.make_space(tree["spaces"]["observation"])
+        agent.action_space = persistence.make_space(tree["spaces"]["action"])
+        agent.n_envs = tree["n_envs"]
+        if env is not None:
+            wrapped = cls._wrap_env(env, agent.verbose)
+            refuse_vec_normalize(wrapped)
+            check_for_correct_spaces(wrapped, agent.observation_space, agent.action_space)
+            agent.env, agent.n_envs = wrapped, wrapped.num_envs
+        noise = agent.action_noise
+        if isinstance(noise, VectorizedActionNoise) and noise.n_envs != agent.n_envs:
+            agent.action_noise = noise.base_noise
+        agent._setup_model()
+        persistence.restore(agent, tree, same_envs=agent.n_envs == tree["n_envs"] and not force_reset)
+        agent._loaded = True
+        return agent
+
+    def copy(self: SelfSkillGraphAgent, env: GymEnv) -> SelfSkillGraphAgent:
+        """
+        Copy the agent, replay buffer included; what the copy learns leaves this one as it is.
+
+        :param env: environment of the copy
+        :return: the copy
+        """
+        agent_file, replay_file = io.BytesIO(), io.BytesIO()
+        self.save(agent_file)
+        self.save_replay_buffer(replay_file)
+        # What is stored by name only is given again.
+        named = {name: value for name, value in self._arguments.items() if callable(value) or hasattr(value, "propose")}
+        agent = type(self).load(agent_file, env=env, device=self.device, **named)
+        agent.load_replay_buffer(replay_file)
+        return agent
+
+    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
+        """
+        Give the agent another environment with the same spaces and the same number of copies.
+
+        :param env: the environment
+        :param force_reset: whether ``learn`` begins at a fresh episode; False to go on, after ``load``, where the saved
+            environments were
+        :raises ValueError: if the environment does not fit, or is normalised by VecNormalize
+        """
+        refuse_vec_normalize(env)
+        super().set_env(env, force_reset)
+        if force_reset:
+            self._env_snapshot, self._loaded = None, False

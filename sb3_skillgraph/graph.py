@@ -1,366 +1,382 @@
-"""The skill graph: a thin layer over one ``networkx.DiGraph`` (sections 3.1, 3.2.6, A.2)."""
+"""The skill graph: events, the options that lead from one to another, and the record of their runs (section 3.1)."""
 
-import functools
-import itertools
-import math
-import operator
-from collections import deque
-from collections.abc import Callable, Collection, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
-import networkx as nx
+import networkx
 import numpy as np
 
-from sb3_skillgraph.events import EventBank, SalientEvent
-from sb3_skillgraph.options.bank import OptionBank
-from sb3_skillgraph.options.option import Option
-from sb3_skillgraph.routes import Routes, Tree
+from sb3_skillgraph.events import Event
 
-TRIGGERS_LENGTH = 50
-CACHED_TREES = 64  # while nothing changes, many plans begin at the same options
+#: What stands in place of an event's index where there is none. Of an array with one more entry than there are events it
+#: is the last entry.
+NOWHERE = -1
+#: Landmarks lie at least so many event radii apart: 1.5 to 3 make the same agent, fewer make plans cheaper.
+SPACING = 1.5
+#: Edges out of an event, at most; a plan looks at all of them.
+MAX_DEGREE = 16
+#: Different events in which failed runs of one edge have landed that are told apart.
+MAX_LANDINGS = 4
+#: Half of its training ago the walker was another one: what ran then counts half as much, to this power.
+AGING = 1.0
+#: Updates of the walker before which runs do not age: all of its training so far would be "half of it ago".
+YOUNG = 500.0
+#: By how much the cover's radius grows when there are too many events.
+GROWTH = 1.25
+
+_NUMBERS = ("forward", "backward", "crossing_steps", "successes", "success_steps", "failures", "updated")
 
 
-class GraphPath(NamedTuple):
-    """A way through the graph: the ids of its vertices, the sum of its edges' weights, the product of their rates."""
+class Edges:
+    """Which options can be begun in which events, and how they did: one row for each pair, in growing arrays.
 
-    vertices: tuple[str, ...]
-    cost: float
-    success_probability: float
+    ``source`` and ``target`` are indices of events; the option is the walk to ``target``.
+
+    ``forward``, ``backward``: how often trajectories went from source to target, and the other way, in few steps
+    ``crossing_steps``: environment steps they took from source to target in the mean (backwards where none went forward)
+    ``successes``, ``failures``: runs, weighted by age; ``success_steps``: steps of the successful ones, summed likewise
+    ``landing``, ``landing_weight``: the events where failed runs landed, and how many, shape ``(n, MAX_LANDINGS)``
+    ``updated``: the time (updates of the walker) for which the weights hold
+    """
+
+    def __init__(self) -> None:
+        self.size = 0
+        self._arrays: dict[str, np.ndarray] = {
+            "source": np.zeros(64, dtype=np.int64),
+            "target": np.zeros(64, dtype=np.int64),
+            "landing": np.full((64, MAX_LANDINGS), NOWHERE, dtype=np.int64),
+            "landing_weight": np.zeros((64, MAX_LANDINGS)),
+            **{name: np.zeros(64) for name in _NUMBERS},
+        }
+        self._rows: dict[tuple[int, int], int] = {}
+
+    def __getattr__(self, name: str) -> np.ndarray:
+        try:
+            return self.__dict__["_arrays"][name][: self.__dict__["size"]]
+        except KeyError as error:
+            raise AttributeError(name) from error
+
+    def find(self, source: int, target: int) -> int | None:
+        """Return the row of a pair of events; None if there is no such edge."""
+        return self._rows.get((source, target))
+
+    def add(self, source: int, target: int, now: float) -> int:
+        """Return the row of a pair of events, which is made if there is none.
+
+        :param source: index of the event that the option is begun in
+        :param target: index of the event that it leads to
+        :param now: the time, in updates of the walker
+        """
+        row = self._rows.get((source, target))
+        if row is not None:
+            return row
+        row = self.size
+        if row == len(self._arrays["source"]):
+            for name, array in self._arrays.items():
+                self._arrays[name] = np.concatenate([array, np.zeros_like(array)])
+        for array in self._arrays.values():
+            array[row] = 0
+        self._arrays["landing"][row] = NOWHERE
+        self._arrays["source"][row], self._arrays["target"][row], self._arrays["updated"][row] = source, target, now
+        self._rows[source, target] = row
+        self.size += 1
+        return row
+
+    def keep(self, rows: np.ndarray) -> None:
+        """Let go of all other rows.
+
+        :param rows: row numbers, ascending
+        """
+        for array in self._arrays.values():
+            array[: len(rows)] = array[rows]
+        self.size = len(rows)
+        pairs = zip(self.source.tolist(), self.target.tolist(), strict=True)
+        self._rows = {pair: row for row, pair in enumerate(pairs)}
+
+    def get_state(self) -> dict[str, np.ndarray]:
+        """Return all columns."""
+        return {name: array[: self.size].copy() for name, array in self._arrays.items()}
+
+    def set_state(self, state: dict[str, np.ndarray]) -> None:
+        """Restore what :meth:`get_state` returned."""
+        self.size = len(state["source"])
+        self._arrays = {name: np.array(state[name]) for name in self._arrays}
+        if self.size == 0:
+            self._arrays = Edges()._arrays
+        self.keep(np.arange(self.size))
 
 
 class SkillGraph:
-    """Events and mature options as vertices; an edge where one leads into the other.
+    """Events and walks as vertices, and what is known of how to get from one to another.
 
-    ============== ================================================ ==========================================
-    edge           exists while                                     weight
-    ============== ================================================ ==========================================
-    option, target the option has a success rate (it ends there)    runs it takes to succeed, on average: one
-    option, event  its effect set lies in the event                 success and, ``failure_cost`` each, the
-    option, option the effect set of the first lies in the          failures before it; the success rate is
-                   initiation set of the second                     taken times the share of effects inside
-    event, option  the event's trigger points lie in the option's   0 (to be in the event is to be able to
-                   initiation set                                   start the option)
-    ============== ================================================ ==========================================
-
-    *Lies in* means that at least a share ``containment`` of the recent samples do. Every edge carries ``weight`` and
-    ``success_rate``; every vertex carries its ``item``.
+    An event is the vertex ``e7``; the walk to it, an option that every agent has as soon as it has the event, is ``w7``.
 
     :param goal_dim: dimension of goal space
-    :param containment: share of samples that must lie inside; 1.0 is the paper's strict rule
-    :param rate_prior: pseudo-counts of successes and of failures in every success rate; zeros give the paper's fraction
-    :param evidence_edges: whether runs begun in an event and mostly successful put the event into the option's
-        initiation set, which makes an event-option edge
-    :param min_success_rate: edges whose rate falls below it are dropped, so that no plan uses them
-    :param failure_cost: what a failed run costs, in successful ones; with 1 a weight is the paper's 1 / success rate
+    :param radius: radius of the events, in goal units
+    :param max_events: how many there may be; when there are more the cover grows coarser
     """
 
-    def __init__(
-        self,
-        goal_dim: int,
-        containment: float = 0.9,
-        rate_prior: tuple[float, float] = (1.9, 0.1),
-        evidence_edges: bool = True,
-        min_success_rate: float = 0.3,
-        failure_cost: float = 5.0,
-    ) -> None:
-        self.nx = nx.DiGraph()
+    def __init__(self, goal_dim: int, radius: float, max_events: int) -> None:
         self.goal_dim = goal_dim
-        self.containment = containment
-        self.rate_prior = rate_prior
-        self.evidence_edges = evidence_edges
-        self.min_success_rate = min_success_rate
-        self.failure_cost = failure_cost
-        self.events: dict[str, SalientEvent] = {}
-        self.options: dict[str, Option] = {}
-        self.triggers: dict[str, deque[np.ndarray]] = {}
-        # (event, option) -> recent outcomes of the option's runs that began in the event
-        self.evidence: dict[tuple[str, str], deque[bool]] = {}
-        self.version = 0
-        self.event_bank, self.option_bank = EventBank(goal_dim), OptionBank(goal_dim)
-        self._routes = Routes()
-        self._trees: dict[tuple[Any, ...], Tree] = {}
+        self.radius = radius
+        self.max_events = max_events
+        self.max_degree = MAX_DEGREE
+        self.cover_radius = SPACING * radius
+        self.events: list[Event] = []
+        self.edges = Edges()
+        self.now = 0.0  # updates of the walker so far: the clock by which records age
+        self.version = 0  # rises with every change
+        self.visits = np.zeros(64)  # of each event
+        self._centers = np.zeros((64, goal_dim))
+        self.walk_ids: list[str] = []  # of the walks to the events, in their order
+        self._index: dict[str, int] = {}  # of events, by their ids and by those of the walks to them
+        self._n_made = 0
+        self._nx: tuple[int, networkx.DiGraph] = (-1, networkx.DiGraph())
 
-    # -- vertices -----------------------------------------------------------------------------------------------------
+    def __repr__(self) -> str:
+        return f"<SkillGraph of {len(self.events)} events and {self.edges.size} edges>"
 
-    def add_event(self, event: SalientEvent) -> None:
-        """Add a salient event as a vertex.
+    # -- events -------------------------------------------------------------------------------------------------------
 
-        :raises ValueError: if a vertex of that id exists
+    @property
+    def centers(self) -> np.ndarray:
+        """Centres of the events, shape ``(n_events, goal_dim)``."""
+        return self._centers[: len(self.events)]
+
+    def index(self, id: str) -> int:
+        """Return the index of an event, or of the event that a walk leads to; ``NOWHERE`` for an id of neither."""
+        return self._index.get(id, NOWHERE)
+
+    def id(self, index: int) -> str:
+        """Return the id of an event, an empty string for ``NOWHERE``."""
+        return "" if index == NOWHERE else self.events[index].id
+
+    def locate(self, point: np.ndarray) -> int:
+        """Return the index of the event that a point belongs to: the nearest, if it lies within the cover's radius.
+
+        :param point: shape ``(goal_dim,)``
+        :return: the index; ``NOWHERE`` if there is none so near
         """
-        self._add_vertex(event.id, event)
-        self.events[event.id] = event
-        self.event_bank.add(event)
-        self.triggers[event.id] = deque([event.center], maxlen=TRIGGERS_LENGTH)
+        if not self.events:
+            return NOWHERE
+        offsets = self.centers - point
+        squared = np.einsum("ij,ij->i", offsets, offsets)
+        nearest = int(squared.argmin())
+        return nearest if squared[nearest] <= self.cover_radius**2 else NOWHERE
 
-    def add_option(self, option: Option) -> None:
-        """Add a mature option as a vertex, with the edges that follow from its sets.
+    def distances(self, point: np.ndarray) -> np.ndarray:
+        """Return how far the events are from a point, shape ``(n_events,)``, in goal units."""
+        return np.linalg.norm(self.centers - point, axis=1)
 
-        :raises ValueError: if the option is not mature, or a vertex of that id exists
+    def add_event(self, center: np.ndarray, *, salient: bool) -> int:
+        """Add an event; where there is no room for another one the cover grows coarser first.
+
+        :param center: shape ``(goal_dim,)``
+        :param salient: whether it is a target of its own, or a landmark
+        :return: its index
         """
-        if not option.mature:
-            raise ValueError(f"Option {option.id!r} is still gestating; only mature options belong in the graph.")
-        self._add_vertex(option.id, option)
-        self.options[option.id] = option
-        self.refresh(option, refitted=True)
-
-    def _add_vertex(self, id: str, item: SalientEvent | Option) -> None:
-        if id in self.nx:
-            raise ValueError(f"The graph already has a vertex {id!r}.")
-        self.nx.add_node(id, item=item)
-        self._routes.add_vertex(id)
-        self._changed()
-
-    def remove_options(self, ids: Collection[str]) -> None:
-        """Take options out of the graph, with all their edges.
-
-        :param ids: their ids
-        """
-        self.nx.remove_nodes_from(ids)
-        for id in ids:
-            del self.options[id]
-        self.evidence = {key: value for key, value in self.evidence.items() if key[1] in self.nx}
-        self._index()
-        self._changed()
-
-    def _index(self) -> None:
-        """Build anew what answers questions fast."""
-        goal_dim = self.goal_dim
-        self.event_bank, self.option_bank, self._routes = EventBank(goal_dim), OptionBank(goal_dim), Routes()
-        for event in self.events.values():
-            self.event_bank.add(event)
-            self.event_bank.triggered(event, np.stack(self.triggers[event.id]))
-        for option in self.options.values():
-            self.option_bank.put(option)
-        for id in self.nx:
-            self._routes.add_vertex(id)
-        for source, target, weight in self.nx.edges(data="weight"):
-            self._routes.set_edge(source, target, weight)
-
-    def _changed(self) -> None:
+        i = len(self.events)
+        event = Event(f"e{self._n_made}", np.array(center, dtype=np.float64), self.radius, salient)
+        if i == len(self._centers):
+            self._centers = np.concatenate([self._centers, np.zeros_like(self._centers)])
+            self.visits = np.concatenate([self.visits, np.zeros_like(self.visits)])
+        self.events.append(event)
+        self.walk_ids.append(f"w{self._n_made}")
+        self._centers[i], self.visits[i] = event.center, 0.0
+        self._index[event.id] = self._index[self.walk_ids[i]] = i
+        self._n_made += 1
         self.version += 1
-        self._trees.clear()
+        return i
 
-    # -- what runs teach ----------------------------------------------------------------------------------------------
+    def coarsen(self) -> np.ndarray:
+        """Merge events that lie close together, salient ones last; their records become one.
 
-    def triggered(self, event: SalientEvent, point: np.ndarray) -> None:
-        """Remember where an event was triggered; edges out of it must hold there too (section 3.2.6).
-
-        :param event: the event
-        :param point: shape ``(goal_dim,)``
+        :return: the new index of every old event
         """
-        triggers = self.triggers[event.id]
-        triggers.append(np.asarray(point, dtype=np.float64))
-        points = np.stack(triggers)
-        self.event_bank.triggered(event, points)
-        shares = self._startable_shares(points)
-        for id in sorted({*shares, *self.nx.successors(event.id)}):
-            self._event_option_edge(event.id, id, shares.get(id, 0.0))
+        self.cover_radius *= GROWTH
+        order = sorted(range(len(self.events)), key=lambda i: (not self.events[i].salient, i))
+        kept: list[int] = []
+        for i in order:
+            near = np.linalg.norm(self._centers[kept] - self._centers[i], axis=1) < self.cover_radius
+            if not near.any():
+                kept.append(i)
+        kept.sort()
+        centers = self._centers[kept]
+        distances = np.linalg.norm(self.centers[:, None] - centers, axis=2)
+        new_index = distances.argmin(axis=1)
+        self._rename(kept, new_index)
+        return new_index
 
-    def _startable_shares(self, points: np.ndarray) -> dict[str, float]:
-        """Return by option from which share of some points it can start, where that suffices for an edge."""
-        indices, inside = self.option_bank.startable(points)
-        shares = zip(indices.tolist(), inside.mean(axis=0).tolist(), strict=True)
-        return {self.option_bank.options[i].id: share for i, share in shares if share >= self.containment}
+    def _rename(self, kept: list[int], new_index: np.ndarray) -> None:
+        old_edges, visits = self.edges, self.visits[: len(new_index)].copy()
+        self.events = [self.events[i] for i in kept]
+        self.walk_ids = [self.walk_ids[i] for i in kept]
+        self._index = self._build_index()
+        self._centers[: len(kept)] = self._centers[kept]
+        self.visits[:] = 0.0
+        np.add.at(self.visits, new_index, visits)
+        self.edges = Edges()
+        for row in range(old_edges.size):
+            source, target = int(new_index[old_edges.source[row]]), int(new_index[old_edges.target[row]])
+            if source != target:
+                self._pour(old_edges, row, source, target, new_index)
+        self.version += 1
 
-    def ran_from(self, event: SalientEvent, option: Option, success: bool) -> None:
-        """Remember the outcome of a run that began in an event.
+    def _build_index(self) -> dict[str, int]:
+        by_event = {event.id: i for i, event in enumerate(self.events)}
+        return {**by_event, **{walk: i for i, walk in enumerate(self.walk_ids)}}
 
-        While such runs mostly succeed the whole event counts as a place to start the option from, and its initiation
-        set is to hold it.
+    def _pour(self, old: Edges, row: int, source: int, target: int, new_index: np.ndarray) -> None:
+        """Add the record of an old edge to the one that takes its place."""
+        edges, new = self.edges, self._current_row(source, target)
+        weight = self._aging(old.updated[row])
+        n_old, n_new = old.forward[row] + old.backward[row], edges.forward[new] + edges.backward[new]
+        steps = n_old * old.crossing_steps[row] + n_new * edges.crossing_steps[new]
+        edges.crossing_steps[new] = steps / max(n_old + n_new, 1.0)
+        edges.forward[new] += old.forward[row]
+        edges.backward[new] += old.backward[row]
+        for name in ("successes", "success_steps", "failures"):
+            getattr(edges, name)[new] += weight * getattr(old, name)[row]
+        for landing, share in zip(old.landing[row].tolist(), old.landing_weight[row].tolist(), strict=True):
+            if share > 0.0:
+                self._land(new, int(new_index[landing]) if landing != NOWHERE else NOWHERE, weight * share)
+
+    # -- what trajectories and runs teach -----------------------------------------------------------------------------
+
+    def crossed(self, source: int, target: int, steps: float) -> None:
+        """A trajectory went from one event to another: it can be done, and back perhaps.
+
+        :param source: index of the event it came from
+        :param target: index of the event it came to
+        :param steps: environment steps in between
         """
-        outcomes = self.evidence.setdefault((event.id, option.id), deque(maxlen=10))
-        outcomes.append(success)
-        if self.evidence_edges:
-            proven = (sum(outcomes) + 1.0) / (len(outcomes) + 2.0) >= 0.5
-            changed = option.initiation.set_region(event.id, event.outline() if proven else None)
-            if changed and option.initiation.refit(force=True) and option.id in self.options:
-                self.refresh(option, refitted=True)
+        edges = self.edges
+        there, back = edges.add(source, target, self.now), edges.add(target, source, self.now)
+        if edges.forward[there] == 0:
+            edges.crossing_steps[there] = steps
+        edges.forward[there] += 1
+        # A running mean that follows the walker as it learns.
+        edges.crossing_steps[there] += (steps - edges.crossing_steps[there]) / min(edges.forward[there], 10.0)
+        if edges.forward[back] == 0:
+            edges.crossing_steps[back] = edges.crossing_steps[there]
+        edges.backward[back] += 1
+        self.version += 1
 
-    def refresh(self, option: Option, refitted: bool) -> None:
-        """Bring the edges of one option up to date after one of its runs.
+    def ran(self, source: int, target: int, success: bool, landing: int, steps: int) -> None:
+        """A run of a walk has ended: the only thing that changes rates.
 
-        :param option: a mature option of the graph
-        :param refitted: whether its initiation set was fitted anew, so that the edges into it must be looked at too
+        :param source: index of the event it began in
+        :param target: index of the event it was to lead to
+        :param success: whether it did
+        :param landing: index of the event in which it ended, ``NOWHERE`` if in none
+        :param steps: environment steps it took
         """
-        self.option_bank.put(option)
-        if refitted:
-            self._edges_into(option)
-        self._edges_out_of(option)
+        row, edges = self._current_row(source, target), self.edges
+        if success:
+            edges.successes[row] += 1.0
+            edges.success_steps[row] += steps
+        else:
+            edges.failures[row] += 1.0
+            self._land(row, landing, 1.0)
+        self.version += 1
 
-    def _edges_out_of(self, option: Option) -> None:
-        rate = option.success_rate(self.rate_prior)
-        assert option.target is not None, "The global option is no vertex."
-        rates = {option.target: rate}
-        if option.effects:
-            effects = np.stack(option.effects)
-            parent = self.options.get(option.target)
-            if self.containment == 1.0 and parent is not None and not parent.initiation.optimistic(effects).all():
-                del rates[option.target]  # to the letter of the paper; else a chain keeps the edge it was built on
-            shares = self._startable_shares(effects)
-            in_events = self.event_bank.shares(effects)
-            for i in np.flatnonzero(in_events >= self.containment):
-                shares[self.event_bank.events[i].id] = float(in_events[i])
-            rates.update((id, rate * share) for id, share in shares.items() if id not in (option.id, option.target))
-        for id in [*self.nx.successors(option.id)]:
-            if id not in rates:
-                self._set_edge(option.id, id, 0.0)
-        for target, value in rates.items():
-            if target in self.nx:
-                self._set_edge(option.id, target, value)
+    def _current_row(self, source: int, target: int) -> int:
+        """Return the row of an edge, its weights as of now."""
+        row, edges = self.edges.add(source, target, self.now), self.edges
+        weight = self._aging(edges.updated[row])
+        for column in (edges.successes, edges.success_steps, edges.failures, edges.landing_weight):
+            column[row] *= weight
+        edges.updated[row] = self.now
+        return row
 
-    def _edges_into(self, option: Option) -> None:
-        initiation = option.initiation
-        box = self._middles(*initiation.optimistic_boundaries[0].box())
-        events = {event.id for event in self.event_bank.triggered_in(*box)}
-        others = {other.id for other in self.option_bank.ending_in(*box)}
-        before = set(self.nx.predecessors(option.id))
-        for id in sorted(events | (before & self.events.keys())):
-            self._event_option_edge(id, option.id, float(initiation.optimistic(np.stack(self.triggers[id])).mean()))
-        for id in sorted((others | (before & self.options.keys())) - {option.id}):
-            other = self.options[id]
-            if other.effects and (other.target != option.id or self.containment == 1.0):
-                share = float(initiation.optimistic(np.stack(other.effects)).mean())
-                rate = other.success_rate(self.rate_prior) * share if share >= self.containment else 0.0
-                self._set_edge(other.id, option.id, rate)
+    def _aging(self, updated: Any) -> Any:
+        return ((updated + YOUNG) / (self.now + YOUNG)) ** AGING
 
-    def _middles(self, lower: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the box in which the middle of points lies that lie in a box, as far as an edge asks for."""
-        if self.containment > 0.5:
-            return lower, upper
-        return np.full_like(lower, -np.inf), np.full_like(upper, np.inf)
+    def aging(self) -> np.ndarray:
+        """Return by how much the weights of each edge have aged since they were updated, shape ``(n_edges,)``."""
+        return self._aging(self.edges.updated)
 
-    def _event_option_edge(self, event_id: str, option_id: str, share: float) -> None:
-        rate = share if share >= self.containment else 0.0
-        if self.options[option_id].target == event_id:
-            return  # an option does not start where it ends
-        self._set_edge(event_id, option_id, rate, weight=0.0)
+    def _land(self, row: int, landing: int, weight: float) -> None:
+        landings, weights = self.edges.landing[row], self.edges.landing_weight[row]
+        known = np.flatnonzero((landings == landing) & (weights > 0.0))
+        slot = int(known[0]) if len(known) else int(weights.argmin())
+        if not len(known):
+            landings[slot], weights[slot] = landing, 0.0
+        weights[slot] += weight
 
-    def _set_edge(self, source: str, target: str, rate: float, weight: float | None = None) -> None:
-        """Set, change or (rate too low) delete an edge."""
-        if rate <= 0.0 or rate < self.min_success_rate:
-            if self.nx.has_edge(source, target):
-                self.nx.remove_edge(source, target)
-                self._routes.remove_edge(source, target)
-                self._changed()
-            return
-        weight = 1.0 + self.failure_cost * (1.0 / rate - 1.0) if weight is None else weight
-        known = self.nx.get_edge_data(source, target)
-        if known is None or known["success_rate"] != rate:
-            self.nx.add_edge(source, target, weight=weight, success_rate=rate)
-            self._routes.set_edge(source, target, weight)
-            self._changed()
+    def degree(self, source: int) -> int:
+        """Return how many edges lead out of an event."""
+        return int(np.count_nonzero(self.edges.source == source))
 
-    # -- questions ----------------------------------------------------------------------------------------------------
+    def bound_degree(self, source: int, worth: np.ndarray) -> None:
+        """Let go of the edges of an event that are worth least, if it has too many.
 
-    def startable(self, point: np.ndarray) -> list[str]:
-        """Return the ids of the options whose initiation set contains a point.
-
-        :param point: shape ``(goal_dim,)``
+        :param source: index of the event
+        :param worth: of every edge, shape ``(n_edges,)``
         """
-        indices, _ = self.option_bank.startable(np.asarray(point)[None])
-        return [self.option_bank.options[i].id for i in indices]
+        rows = np.flatnonzero(self.edges.source == source)
+        if len(rows) > self.max_degree:
+            dropped = rows[np.argsort(worth[rows], kind="stable")[: len(rows) - self.max_degree]]
+            self.edges.keep(np.delete(np.arange(self.edges.size), dropped))
+            self.version += 1
 
-    def useful(self, point: np.ndarray) -> list[str]:
-        """Return the ids of the options that can start at a point and do not end there at once.
+    # -- looking at it ------------------------------------------------------------------------------------------------
 
-        :param point: shape ``(goal_dim,)``
+    @property
+    def nx(self) -> networkx.DiGraph:
+        """The graph as networkx has it, numbers and strings only: a copy to look at, made when asked for.
+
+        Edges from an event to a walk carry the record of the walk's runs from there; edges from a walk to an event the
+        share of its runs that landed there, wherever they began.
         """
-        return [id for id in self.startable(point) if not self.options[id].terminates(np.asarray(point))]
+        if self._nx[0] != self.version:
+            self._nx = (self.version, self._build_nx())
+        return self._nx[1]
 
-    def ending_in(self, region: SalientEvent) -> list[Option]:
-        """Return the options whose effect set lies in a region."""
-        candidates = self.option_bank.ending_in(*self._middles(region.center - region.radius, region.center + region.radius))
-        return [o for o in candidates if region.contains(np.stack(o.effects)).mean() >= self.containment]
-
-    def ways_from(self, sources: Sequence[str], avoid: Collection[str] = ()) -> Tree:
-        """Return the cheapest ways from any of some vertices to all others (cached until the graph changes).
-
-        :param sources: ids of vertices
-        :param avoid: ids of vertices that no way may lead through
-        """
-        key = (tuple(sources), tuple(avoid))
-        return self._tree(key, lambda: self._routes.ways_from(sources, avoid))
-
-    def ways_to(self, target: str) -> Tree:
-        """Return the cheapest ways from all vertices to one (cached until the graph changes)."""
-        return self._tree((target,), lambda: self._routes.ways_to(target))
-
-    def _tree(self, key: tuple[Any, ...], grow: Callable[[], Tree]) -> Tree:
-        if key not in self._trees:
-            if len(self._trees) >= CACHED_TREES:
-                self._trees.clear()
-            self._trees[key] = grow()
-        return self._trees[key]
-
-    def shortest_path(self, sources: Sequence[str], target: str) -> GraphPath | None:
-        """Find the cheapest path from any of some vertices to another (section 3.2.4).
-
-        :param sources: ids of vertices
-        :param target: id of a vertex
-        :return: the path, source and target included; None if there is none
-        """
-        return self.path_on(self.ways_from(sources), target)
-
-    def path_on(self, tree: Tree, target: str) -> GraphPath | None:
-        """Return the path to a vertex on a tree of :meth:`ways_from`; None if there is none."""
-        if target not in tree:
-            return None
-        vertices = tuple(tree.path(target))
-        return GraphPath(vertices, tree.cost(target), self.success_probability(vertices))
-
-    def success_probability(self, vertices: Sequence[str]) -> float:
-        """Return the product of the success rates along a path."""
-        return math.prod(self.nx.edges[edge]["success_rate"] for edge in itertools.pairwise(vertices))
-
-    def reachable(self, source: str) -> list[str]:
-        """Return the ids of the events that a path leads to from a vertex, itself included if it is one."""
-        tree = self.ways_from([source])
-        return [id for id in self.events if id in tree]
-
-    def joined_pairs(self) -> float:
-        """Return the share of ordered pairs of events that are joined by a path (0 with fewer than two events)."""
-        n = len(self.events)
-        if n < 2:
-            return 0.0
-        components = nx.condensation(self.nx)
-        bit = {id: 1 << i for i, id in enumerate(self.events)}
-        # The events that can be reached from each strongly connected component, as bits of an integer.
-        reached: dict[int, int] = {}
-        for component in reversed(list(nx.topological_sort(components))):
-            own = sum(bit.get(id, 0) for id in components.nodes[component]["members"])
-            reached[component] = functools.reduce(operator.or_, (reached[c] for c in components.successors(component)), own)
-        of = components.graph["mapping"]
-        return sum(reached[of[event]].bit_count() - 1 for event in self.events) / (n * (n - 1))
+    def _build_nx(self) -> networkx.DiGraph:
+        graph, edges = networkx.DiGraph(), self.edges
+        for i, event in enumerate(self.events):
+            place = {f"x{k}": float(x) for k, x in enumerate(event.center)}
+            graph.add_node(event.id, kind="event", salient=event.salient, radius=event.radius, **place)
+            graph.add_node(self.walk_ids[i], kind="walk", target=event.id)
+        columns = {name: getattr(edges, name).tolist() for name in _NUMBERS if name != "updated"}
+        landed: dict[tuple[str, str], float] = {}
+        for row, (source, target) in enumerate(zip(edges.source.tolist(), edges.target.tolist(), strict=True)):
+            walk = self.walk_ids[target]
+            graph.add_edge(self.events[source].id, walk, **{name: values[row] for name, values in columns.items()})
+            ends = [(target, columns["successes"][row])]
+            ends += zip(edges.landing[row].tolist(), edges.landing_weight[row].tolist(), strict=True)
+            for end, weight in ends:
+                if weight > 0.0 and end != NOWHERE:
+                    key = walk, self.events[end].id
+                    landed[key] = landed.get(key, 0.0) + weight
+        runs = np.zeros(len(self.events))
+        np.add.at(runs, edges.target, edges.successes + edges.failures)
+        for (walk, end), weight in landed.items():
+            graph.add_edge(walk, end, rate=weight / runs[self.index(graph.nodes[walk]["target"])])
+        return graph
 
     # -- saving -------------------------------------------------------------------------------------------------------
 
     def get_state(self) -> dict[str, Any]:
-        """Return events, edges and evidence as plain data; options are saved by their owner."""
+        """Return the graph as plain data."""
         return {
-            "events": [event.get_state() for event in self.events.values()],
-            "options": list(self.options),
-            "nodes": list(self.nx.nodes),
-            "version": self.version,
-            "edges": [[u, v, d] for u, v, d in self.nx.edges(data=True)],
-            "triggers": {id: list(points) for id, points in self.triggers.items()},
-            "evidence": [[event, option, list(record)] for (event, option), record in self.evidence.items()],
+            "events": [event.get_state() for event in self.events],
+            "walks": list(self.walk_ids),
+            "edges": self.edges.get_state(),
+            "visits": self.visits[: len(self.events)].copy(),
+            "cover_radius": self.cover_radius,
+            "now": self.now,
+            "n_made": self._n_made,
         }
 
-    def set_state(self, state: dict[str, Any], options: dict[str, Option]) -> None:
-        """Restore what :meth:`get_state` returned.
-
-        :param state: the state
-        :param options: the restored options by id
-        """
-        self.nx.clear()
-        self.events = {spec["id"]: SalientEvent(**spec) for spec in state["events"]}
-        self.options = {id: options[id] for id in state["options"]}
-        for id in state["nodes"]:
-            self.nx.add_node(id, item=self.events.get(id) or self.options[id])
-        for source, target, attributes in state["edges"]:
-            self.nx.add_edge(source, target, **attributes)
-        self.triggers = {id: deque(points, maxlen=TRIGGERS_LENGTH) for id, points in state["triggers"].items()}
-        self.evidence = {(event, option): deque(r, maxlen=10) for event, option, r in state["evidence"]}
-        self.version = state["version"]
-        self._index()
-        self._trees.clear()
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Restore what :meth:`get_state` returned."""
+        self.events, self.walk_ids, self.edges = [], [], Edges()
+        for spec in state["events"]:
+            self.events[self.add_event(spec["center"], salient=spec["salient"])] = Event(**spec)
+        self.walk_ids = list(state["walks"])
+        self._index = self._build_index()
+        self.visits[: len(self.events)] = state["visits"]
+        self.edges.set_state(state["edges"])
+        self.cover_radius, self.now, self._n_made = state["cover_radius"], state["now"], state["n_made"]
+        self.version += 1

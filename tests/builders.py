@@ -11,7 +11,7 @@ from hypothesis import HealthCheck, Phase, settings
 
 from sb3_skillgraph.chaining import DeepSkillChaining
 from sb3_skillgraph.controller import Controller
-from sb3_skillgraph.events import SalientEvent, TerminationSet
+from sb3_skillgraph.events import Event, TerminationSet
 from sb3_skillgraph.graph import SkillGraph
 from sb3_skillgraph.options.factory import OptionFactory
 from sb3_skillgraph.options.initiation import Boundary, InitiationSet
@@ -19,7 +19,7 @@ from sb3_skillgraph.options.learner import OptionDDPG
 from sb3_skillgraph.options.option import Option
 from sb3_skillgraph.options.views import ScaledView, View, relative_view
 from sb3_skillgraph.planner import GraphPlanner
-from sb3_skillgraph.replay import TransitionStore
+from sb3_skillgraph.memory.replay import TransitionStore
 from sb3_skillgraph.visited import VisitedStates
 
 TINY_NETS: dict[str, Any] = {"policy_kwargs": {"net_arch": [4]}}
@@ -118,8 +118,8 @@ def make_option(
     return option
 
 
-def event(index: int, *center: float, radius: float = 1.0) -> SalientEvent:
-    return SalientEvent(f"e{index}", np.array(center), radius)
+def event(index: int, *center: float, radius: float = 1.0) -> Event:
+    return Event(f"e{index}", np.array(center), radius)
 
 
 class World:
@@ -150,7 +150,7 @@ class World:
         self.made.append(option)
         return option
 
-    def add_event(self, *center: float) -> SalientEvent:
+    def add_event(self, *center: float) -> Event:
         added = event(len(self.graph.events), *center)
         self.graph.add_event(added)
         events = list(self.graph.events.values())
@@ -159,7 +159,7 @@ class World:
 
     def add_option(
         self,
-        target: SalientEvent,
+        target: Event,
         start: Sequence[float],
         *,
         start_radius: float = 3.0,

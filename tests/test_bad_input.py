@@ -32,7 +32,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_skillgraph import OptionEnv, SkillGraphAgent
-from sb3_skillgraph.events import SalientEvent
+from sb3_skillgraph.events import Event
 from sb3_skillgraph.saving import SCHEMA
 
 
@@ -160,7 +160,7 @@ def test_environment_of_another_shape(trained_files: tuple[Path, Path]) -> None:
 
 
 def test_option_env_needs_a_goal_environment() -> None:
-    event = SalientEvent("e", np.zeros(2), 0.5)
+    event = Event("e", np.zeros(2), 0.5)
     with pytest.raises(ValueError, match="goal environment"):
         OptionEnv(gym.make("Pendulum-v1"), event)
     with pytest.raises(ValueError, match="shape"):

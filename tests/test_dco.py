@@ -6,8 +6,8 @@ import torch as th
 from conftest import new_agent
 from scipy.stats import spearmanr
 
-from sb3_skillgraph.replay import TransitionStore
-from sb3_skillgraph.salience.dco import DCOSalience, FiedlerEmbedding
+from sb3_skillgraph.memory.replay import TransitionStore
+from sb3_skillgraph.learning.dco import DCOSalience, FiedlerEmbedding
 from sb3_skillgraph.visited import VisitedStates
 
 

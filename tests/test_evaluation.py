@@ -13,7 +13,7 @@ from sb3_skillgraph import SkillGraphAgent
 from sb3_skillgraph.controller import GLOBAL, OptionOutcome
 from sb3_skillgraph.envs import U_MAZE, MazeGeometry, MazeMap
 from sb3_skillgraph.evaluation import PairResult, PairsResult, SkillTrace, evaluate_pairs
-from sb3_skillgraph.events import SalientEvent
+from sb3_skillgraph.events import Event
 
 CORRIDOR: MazeMap = [[1] * 9, [1, "r", 0, 0, 0, 0, 0, 0, 1], [1] * 9]
 
@@ -199,7 +199,7 @@ def test_plan_tells_the_three_cases(trained: SkillGraphAgent) -> None:
     grid = np.stack(np.meshgrid(np.linspace(-1.5, 1.5, 25), np.linspace(-1.5, 1.5, 25)), axis=-1).reshape(-1, 2)
     plans = [(point, trained.plan(observation(*start), goal=point)) for point in grid]
     for point, plan in plans:
-        region = SalientEvent("goal", point, trained.event_radius)
+        region = Event("goal", point, trained.event_radius)
         if any(region.contains(event.center[None])[0] for event in events.values()):
             assert plan.status == "in_graph"
         elif plan.status != "in_graph":

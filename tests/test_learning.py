@@ -19,7 +19,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from sb3_skillgraph import PAPER, OptionEnv, SkillGraphAgent
 from sb3_skillgraph.envs import MazeMap
 from sb3_skillgraph.evaluation import evaluate_pairs, run_pair
-from sb3_skillgraph.events import SalientEvent
+from sb3_skillgraph.events import Event
 from sb3_skillgraph.options.factory import copy_policy
 from sb3_skillgraph.options.learner import OptionDDPG, OptionTD3
 from sb3_skillgraph.options.views import egocentric_view
@@ -281,7 +281,7 @@ def test_every_transition_is_in_the_store_once(n_envs: int, calls: list[tuple[in
 
 def option_env(**kwargs: Any) -> tuple[OptionEnv, Recorder]:
     base = Recorder(gym.make(TOY, max_steps=50))
-    return OptionEnv(base, SalientEvent("east", np.array([1.0, 1.0]), 0.45), **kwargs), base
+    return OptionEnv(base, Event("east", np.array([1.0, 1.0]), 0.45), **kwargs), base
 
 
 def test_option_env_is_a_wrapper_with_a_flat_space() -> None:

@@ -11,11 +11,11 @@ from hypothesis import strategies as st
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
 from sb3_skillgraph.envs import ToyMazeEnv
-from sb3_skillgraph.events import SalientEvent
+from sb3_skillgraph.events import Event
 from sb3_skillgraph.options.env import OptionEnv
 from sb3_skillgraph.options.option import goal_rule, termination_rule
 from sb3_skillgraph.options.views import ScaledView, relative_view
-from sb3_skillgraph.replay import OptionReplay, OptionRule, TransitionStore
+from sb3_skillgraph.memory.replay import OptionReplay, OptionRule, TransitionStore
 
 CAPACITY = 12
 DOOMED_STEPS = 50  # an OptionReplay's own
@@ -158,7 +158,7 @@ def test_state_of_another_shape_is_refused(other: TransitionStore, named: str) -
 # -- an option's view -------------------------------------------------------------------------------------------------
 
 RADIUS = 2.0
-EVENT = SalientEvent("e0", np.array([3.0, 3.0]), 3.0)
+EVENT = Event("e0", np.array([3.0, 3.0]), 3.0)
 OBSERVATION_DIM = 1
 
 
@@ -381,7 +381,7 @@ def test_replay_state_round_trip() -> None:
 
 def test_option_env_and_view_agree_on_the_same_transitions() -> None:
     env = ToyMazeEnv([[1] * 5, *[[1, 0, 0, 0, 1]] * 3, [1] * 5], terminate_on_success=True)
-    event = SalientEvent("e0", np.array([1.0, 0.0]), 0.45)
+    event = Event("e0", np.array([1.0, 0.0]), 0.45)
     option_env = OptionEnv(env, event, timeout=15)
     rng = np.random.default_rng(0)
     store = TransitionStore(3000, 2, 2, 2)

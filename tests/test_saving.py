@@ -16,7 +16,7 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise, VectorizedActionNoise
 
 from sb3_skillgraph import SkillGraphAgent
-from sb3_skillgraph.events import SalientEvent
+from sb3_skillgraph.events import Event
 
 
 def observations(n: int = 16) -> dict[str, np.ndarray]:
@@ -64,7 +64,7 @@ def test_loading_gives_the_same_agent(trained: SkillGraphAgent, tmp_path: Path) 
     assert [event.id for event in loaded.events] == [event.id for event in trained.events]
     assert sorted(loaded.graph.nx.edges(data="weight")) == sorted(trained.graph.nx.edges(data="weight"))
     for id, item in loaded.graph.nx.nodes(data="item"):
-        assert item is (loaded.graph.events[id] if isinstance(item, SalientEvent) else loaded.options[id])
+        assert item is (loaded.graph.events[id] if isinstance(item, Event) else loaded.options[id])
     for i in range(16):
         obs = {key: value[i] for key, value in observations().items()}
         assert loaded.plan(obs) == trained.plan(obs)

@@ -17,7 +17,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_skillgraph import GraphPolicy, OptionsEnv, SkillGraphAgent, SMDPQLearning
-from sb3_skillgraph.events import SalientEvent
+from sb3_skillgraph.events import Event
 from sb3_skillgraph.smdp import FlatPolicy
 
 GAMMA = 0.9
@@ -82,7 +82,7 @@ def test_one_action_is_one_run_of_an_option(agent: SkillGraphAgent) -> None:
 
 
 def test_what_cannot_run_is_masked(agent: SkillGraphAgent) -> None:
-    event = SalientEvent("e0", np.array([1.0, 1.0]), 0.45)
+    event = Event("e0", np.array([1.0, 1.0]), 0.45)
     options = [
         make_option("o1", "e0", event, start=((-1.0, 1.0), 0.5)),
         make_option("o2", "e0", event),  # gestates
@@ -170,7 +170,7 @@ def test_what_it_refuses(agent: SkillGraphAgent) -> None:
         OptionsEnv(gym.make("CartPole-v1"), agent.options)
     with pytest.raises(ValueError, match=r"global_option=agent\.global_option"):
         OptionsEnv(gym.make(TOY), [], primitives=np.zeros((0, 2)))
-    event = SalientEvent("e0", np.zeros(2), 0.45)
+    event = Event("e0", np.zeros(2), 0.45)
     many = [make_option(f"o{i}", "e0", event) for i in range(11)]
     with pytest.raises(ValueError, match=r"11 options and 6 actions .* max_options=16: give max_options=32"):
         OptionsEnv(gym.make(TOY), many, global_option=agent.global_option, max_options=16)

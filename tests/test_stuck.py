@@ -19,7 +19,7 @@ from sb3_skillgraph import OptionEnv, OptionsEnv, SkillGraphAgent, rollouts
 from sb3_skillgraph.baselines import CoveringOptions
 from sb3_skillgraph.controller import FAILED, GLOBAL, ControllerState, Request
 from sb3_skillgraph.evaluation import run_pair
-from sb3_skillgraph.events import SalientEvent
+from sb3_skillgraph.events import Event
 from sb3_skillgraph.plotting import run_plan
 
 PIT, DEPTH = np.array([0.0, 1.4]), 0.45  # beside the way from the toy maze's start
@@ -204,7 +204,7 @@ def test_covering_options_start_over_too() -> None:
 
 def test_option_env_ends_and_is_reset() -> None:
     base = pit_env()
-    env = OptionEnv(base, SalientEvent("far", np.array([1.0, 1.0]), 0.2))
+    env = OptionEnv(base, Event("far", np.array([1.0, 1.0]), 0.2))
     env.reset(seed=0, options={"start": PIT - [DEPTH + 0.1, 0.0]})
     over = False
     while not over:

@@ -21,8 +21,8 @@ from sb3_skillgraph.options.factory import OptionFactory, copy_policy
 from sb3_skillgraph.options.learner import OptionDDPG, OptionTD3
 from sb3_skillgraph.options.option import Option
 from sb3_skillgraph.options.views import ScaledView, as_view
-from sb3_skillgraph.replay import TransitionStore, as_rows
-from sb3_skillgraph.salience.dco import learn_fiedler
+from sb3_skillgraph.memory.replay import TransitionStore, as_rows
+from sb3_skillgraph.learning.dco import learn_fiedler
 from sb3_skillgraph.smdp import FlatPolicy, OptionsEnv, SMDPQLearning
 from sb3_skillgraph.smdp.options_env import MOST_AXES
 

@@ -6,8 +6,8 @@ import numpy as np
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
 from sb3_skillgraph.options.initiation import InitiationSet
-from sb3_skillgraph.replay import OptionReplay
-from sb3_skillgraph.salience.dco import FiedlerEmbedding
+from sb3_skillgraph.memory.replay import OptionReplay
+from sb3_skillgraph.learning.dco import FiedlerEmbedding
 
 TERMINATION_SHARE = 0.05  # of the states seen, those with the lowest values are where an option ends
 

@@ -10,7 +10,7 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.type_aliases import TrainFrequencyUnit
 
 from sb3_skillgraph.agent import SkillGraphAgent
-from sb3_skillgraph.replay import as_rows
+from sb3_skillgraph.memory.replay import as_rows
 
 
 class NewGoals(gym.Wrapper):

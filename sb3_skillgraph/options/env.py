@@ -6,7 +6,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from sb3_skillgraph.events import SalientEvent
+from sb3_skillgraph.events import Event
 from sb3_skillgraph.options.execution import Fate, fate
 from sb3_skillgraph.options.initiation import InitiationSet
 from sb3_skillgraph.options.option import Option, termination_rule
@@ -35,7 +35,7 @@ class OptionEnv(gym.Wrapper):
     def __init__(
         self,
         env: gym.Env,
-        termination: SalientEvent | Option,
+        termination: Event | Option,
         *,
         initiation: InitiationSet | None = None,
         timeout: int = 200,

@@ -2,15 +2,13 @@
 The gradient step of SB3's DDPG and TD3 for plain networks, written out without autograd.
 
 The numbers are SB3's, the order of random draws too. What is saved: the gradients of the critic's weights that the
-actor's loss never uses, autograd's book-keeping, Adam's and Polyak's loops over parameters in Python, and, where the
-processor gains from it, MKL's matrix products in favour of oneDNN's.
+actor's loss never uses, autograd's book-keeping, and Adam's and Polyak's loops over parameters in Python.
 
 Nothing is kept beside the model: weights stay SB3's own parameters and the moments of Adam stay in
 ``optimizer.state``, so ``state_dict``, ``load_state_dict``, ``set_parameters`` and copies mean what they always meant.
 """
 
-import functools
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import torch as th
@@ -22,27 +20,8 @@ from torch import nn
 
 from sb3_skillgraph.options.plain_networks import is_plain, is_vector_space, linears
 
-# A call of oneDNN costs about 10 us more than one of MKL: only layers with this many weights win it back.
-ONEDNN_MIN_WEIGHTS = 32_768
 # MKL is up to four times slower at a product whose result is this narrow than at the transposed one.
 NARROW = 64
-
-
-@functools.cache
-def onednn_linear() -> Callable[..., th.Tensor] | None:
-    """
-    OneDNN's fused linear layer, which is a private operator of torch and so may be missing.
-
-    :return: the operator (input, weight, bias, "none" or "relu", [], "") -> output, or None where it does not work
-    """
-    if not th.backends.mkldnn.is_available():
-        return None
-    try:
-        operator = th.ops.mkldnn._linear_pointwise.default
-        operator(th.ones(2, 3), th.ones(4, 3), th.ones(4), "relu", [], "")
-    except (AttributeError, NotImplementedError, RuntimeError, TypeError):
-        return None
-    return operator
 
 
 class Layer:
@@ -55,8 +34,6 @@ class Layer:
     def __init__(self, linear: nn.Linear) -> None:
         self.weight = linear.weight
         self.bias = linear.bias
-        use_onednn = linear.weight.device.type == "cpu" and linear.weight.numel() >= ONEDNN_MIN_WEIGHTS
-        self.product = onednn_linear() if use_onednn else None
 
     def forward(self, inputs: th.Tensor, relu: bool) -> th.Tensor:
         """
@@ -64,8 +41,6 @@ class Layer:
         :param relu: whether a ReLU follows
         :return: (batch, out)
         """
-        if self.product is not None:
-            return self.product(inputs, self.weight, self.bias, "relu" if relu else "none", [], "")
         outputs = nn.functional.linear(inputs, self.weight, self.bias)
         return outputs.relu_() if relu else outputs
 
@@ -74,8 +49,6 @@ class Layer:
         :param gradient: (batch, out), of the loss by what this layer returned
         :return: (batch, in)
         """
-        if self.product is not None:
-            return self.product(gradient, self.weight.t(), None, "none", [], "")
         return th.mm(gradient, self.weight)
 
     def parameter_gradients(self, inputs: th.Tensor, gradient: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
@@ -84,9 +57,7 @@ class Layer:
         :param gradient: (batch, out), of the loss by what this layer returned
         :return: (out, in) for the weight and (out,) for the bias
         """
-        if self.product is not None:
-            weight = self.product(gradient.t(), inputs.t(), None, "none", [], "")
-        elif inputs.shape[1] <= NARROW < gradient.shape[1]:
+        if inputs.shape[1] <= NARROW < gradient.shape[1]:
             # The fused optimiser walks over memory, so the layout has to be that of the weight.
             weight = th.mm(inputs.t(), gradient).t().contiguous()
         else:

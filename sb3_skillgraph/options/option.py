@@ -10,7 +10,7 @@ from stable_baselines3.common.policies import BasePolicy
 from sb3_skillgraph.events import TerminationSet
 from sb3_skillgraph.options.initiation import InitiationSet
 from sb3_skillgraph.options.numpy_actor import NumpyActor
-from sb3_skillgraph.replay import OptionReplay, OptionRule
+from sb3_skillgraph.memory.replay import OptionReplay, OptionRule
 
 RECORD_LENGTH = 10  # runs that count: an option's policy changes, and old runs speak of an old policy
 EFFECTS_LENGTH = 50
@@ -159,7 +159,7 @@ def goal_rule(radius: float, gamma: float = 0.99, shaping: float = 0.0) -> Optio
     """Return the rule of an option that is given its goal: it ends within ``radius`` of it.
 
     :param radius: distance in goal units
-    :param gamma: see :class:`~sb3_skillgraph.replay.OptionRule`
+    :param gamma: see :class:`~sb3_skillgraph.memory.replay.OptionRule`
     :param shaping: likewise
     :return: the rule of the global option, and of every transition relabelled in hindsight
     """
@@ -176,7 +176,7 @@ def termination_rule(termination: TerminationSet, radius: float, gamma: float = 
 
     :param termination: where the option ends
     :param radius: radius of a goal put in by hindsight, in goal units
-    :param gamma: see :class:`~sb3_skillgraph.replay.OptionRule`
+    :param gamma: see :class:`~sb3_skillgraph.memory.replay.OptionRule`
     :param shaping: likewise
     :return: the rule
     """

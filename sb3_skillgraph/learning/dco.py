@@ -1,13 +1,17 @@
 """Salient events by deep covering options: the two ends of the explored space (sections 2.3, 3.2.1, A.1)."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import torch as th
 from stable_baselines3.common.torch_layers import create_mlp
 
-from sb3_skillgraph.replay import TransitionStore
-from sb3_skillgraph.visited import VisitedStates
+from sb3_skillgraph.graph import SkillGraph
+from sb3_skillgraph.memory.replay import TransitionStore
+
+#: Environment steps between two embeddings, each of which takes half a second to learn.
+LEARN_EVERY = 5_000
 
 
 class Sine(th.nn.Module):
@@ -120,27 +124,37 @@ def learn_fiedler(store: TransitionStore, reach: int, n_pairs: int, rng: np.rand
 class DCOSalience:
     """The two visited states that are farthest apart in the graph of the agent's transitions (section 3.2.1, *DCO*).
 
-    Whenever there is new experience, a :class:`FiedlerEmbedding` is learned from scratch; where it is largest and where
-    it is smallest are proposed, one after the other.
+    Every ``LEARN_EVERY`` transitions a :class:`FiedlerEmbedding` is learned from scratch; where it is largest and where it is
+    smallest are proposed in turn.
 
     :param store: the agent's transitions
-    :param visited: the agent's trajectories: events lie on visited states
+    :param graph: the skill graph: its events lie all over what has been visited
     :param reach: environment steps that a pair lies at most apart
     :param n_pairs: pairs that an embedding is learned from
     """
 
-    def __init__(self, store: TransitionStore, visited: VisitedStates, reach: int, n_pairs: int = 20_000) -> None:
+    def __init__(self, store: TransitionStore, graph: SkillGraph, reach: int, n_pairs: int = 20_000) -> None:
         self.store = store
-        self.visited = visited
+        self.graph = graph
         self.reach = reach
         self.n_pairs = n_pairs
-        self._candidates: list[np.ndarray] = []
+        self._ends: list[np.ndarray] = []
         self._learned_from = 0  # transitions
 
     def propose(self, rng: np.random.Generator) -> np.ndarray | None:
-        """Propose one end of the explored space, then the other; None until there is new experience."""
-        if self.store.total > self._learned_from and len(self.store) and self.visited.size:
+        """Propose one end of the explored space or the other; None before there is any experience."""
+        if not len(self.store) or not self.graph.events:
+            return None
+        if not self._ends or self.store.total >= self._learned_from + LEARN_EVERY:
             self._learned_from = self.store.total
-            values = learn_fiedler(self.store, self.reach, self.n_pairs, rng)(self.visited.points)
-            self._candidates = [self.visited.points[i].astype(np.float64) for i in (values.argmin(), values.argmax())]
-        return self._candidates.pop() if self._candidates else None
+            values = learn_fiedler(self.store, self.reach, self.n_pairs, rng)(self.graph.centers)
+            self._ends = [self.graph.centers[i].copy() for i in (values.argmin(), values.argmax())]
+        return self._ends[rng.integers(len(self._ends))]
+
+    def get_state(self) -> dict[str, Any]:
+        """Return what was learned last as plain data."""
+        return {"ends": self._ends, "learned_from": self._learned_from}
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Restore what :meth:`get_state` returned."""
+        self._ends, self._learned_from = list(state["ends"]), state["learned_from"]

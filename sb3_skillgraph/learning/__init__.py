@@ -1,0 +1,1 @@
+"""What an agent does while it learns: missions, evidence, salient events."""

@@ -1,0 +1,172 @@
+"""What the agent is about while it learns: where to go, and to explore from there (sections 3.2.2, 3.2.4)."""
+
+import math
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from sb3_skillgraph.graph import SkillGraph
+from sb3_skillgraph.learning.salience import Salience
+from sb3_skillgraph.runner import Run
+
+#: Failed runs after which a mission is given up.
+MAX_FAILURES = 6
+#: Proposals of which an exploration takes the one whose nearest event has been visited least.
+N_PROPOSALS = 3
+#: Share of the explorations that go on towards the proposed point; the others walk at random.
+TOWARDS = 0.5
+#: Share of the missions that look for a way to a goal which adaptation is for, while nobody has been there.
+LOOK_FOR_A_WAY = 0.5
+
+
+@dataclass
+class Mission:
+    """What one environment's agent is about.
+
+    :param goal: where it travels over the graph, shape ``(goal_dim,)``
+    :param explore_steps: environment steps to explore on arrival
+    :param beyond: the point to explore towards; None for a random walk
+    :param exploring: whether exploration has begun
+    :param n_failures: failed runs on the way
+    """
+
+    goal: np.ndarray
+    explore_steps: int = 0
+    beyond: np.ndarray | None = None
+    exploring: bool = False
+    n_failures: int = 0
+
+    @property
+    def random_walk(self) -> bool:
+        """Whether actions are to be random now."""
+        return self.exploring and self.beyond is None
+
+
+class Missions:
+    """Chooses missions, and tells when they are over.
+
+    :param graph: the skill graph
+    :param salience: proposes salient events
+    :param explore_prob: probability that a mission explores; the others travel to any event
+    :param exploration_steps: environment steps of an exploration
+    :param explore_beyond: event radii that an exploration towards a point goes on past it
+    :param rng: random generator
+    """
+
+    def __init__(
+        self,
+        graph: SkillGraph,
+        salience: Salience,
+        explore_prob: float,
+        exploration_steps: int,
+        explore_beyond: float,
+        rng: np.random.Generator,
+    ) -> None:
+        self.graph = graph
+        self.salience = salience
+        self.explore_prob = explore_prob
+        self.exploration_steps = exploration_steps
+        self.explore_beyond = explore_beyond
+        self.rng = rng
+        self.pinned: np.ndarray | None = None  # the goal that adaptation is for
+        self.current: list[Mission | None] = []
+
+    def cut(self, n_envs: int) -> None:
+        """Forget what the environments were in the middle of."""
+        self.current = [None] * n_envs
+
+    def of(self, env: int, point: np.ndarray, warm_up: bool) -> Mission:
+        """Return an environment's mission; a new one where the last is over.
+
+        :param env: which environment
+        :param point: where the agent stands, shape ``(goal_dim,)``
+        :param warm_up: whether to walk at random, whatever there is to do
+        """
+        mission = self.current[env]
+        if mission is None:
+            mission = self._random_walk(point) if warm_up else self._choose(point)
+            self.current[env] = mission
+        return mission
+
+    def observe(self, env: int, point: np.ndarray, run: Run | None, done: bool) -> bool:
+        """Learn that a step was taken.
+
+        :param env: which environment
+        :param point: where the agent has got to, shape ``(goal_dim,)``
+        :param run: the run that has ended with it
+        :param done: whether the episode is over
+        :return: whether the agent is to do something else now
+        """
+        mission = self.current[env]
+        assert mission is not None
+        was_exploring = mission.exploring
+        if run is not None:
+            mission.n_failures += not run.success
+        over = self._over(mission, point)
+        if over or done:
+            self.current[env] = None
+        return over or done or mission.exploring != was_exploring
+
+    def _over(self, mission: Mission, point: np.ndarray) -> bool:
+        """Whether a mission is over; an exploration begins on arrival, and ends after its steps."""
+        if mission.exploring:
+            mission.explore_steps -= 1
+            return mission.explore_steps <= 0
+        if math.dist(point.tolist(), mission.goal.tolist()) > self.graph.radius:
+            return mission.n_failures >= MAX_FAILURES
+        mission.exploring = mission.explore_steps > 0
+        return not mission.exploring
+
+    # -- choosing -----------------------------------------------------------------------------------------------------
+
+    def _choose(self, point: np.ndarray) -> Mission:
+        if self.pinned is not None:
+            return self._adapt(self.pinned)
+        if self.rng.random() < self.explore_prob:
+            return self._explore(point)
+        return Mission(self.graph.centers[self.rng.integers(len(self.graph.events))].copy())
+
+    def _random_walk(self, point: np.ndarray) -> Mission:
+        return Mission(point.astype(np.float64), explore_steps=self.exploration_steps, exploring=True)
+
+    def _explore(self, point: np.ndarray) -> Mission:
+        """Go to the event nearest to a proposed point, and on towards it or at random.
+
+        Of some proposals it is the one whose event has been visited least.
+        """
+        proposals = [self.salience.propose(self.rng) for _ in range(N_PROPOSALS)]
+        points = [proposal for proposal in proposals if proposal is not None]
+        if not points:
+            return self._random_walk(point)
+        nearest = [int(self.graph.distances(proposal).argmin()) for proposal in points]
+        rarest = int(np.argmin(self.graph.visits[nearest]))
+        return self._beyond(nearest[rarest], points[rarest])
+
+    def _beyond(self, event: int, point: np.ndarray) -> Mission:
+        goal = self.graph.centers[event].copy()
+        if self.rng.random() >= TOWARDS:
+            return Mission(goal, self.exploration_steps)
+        way = point - goal
+        further = self.explore_beyond * self.graph.radius / max(float(np.linalg.norm(way)), 1e-9)
+        return Mission(goal, self.exploration_steps, point + further * way)
+
+    def _adapt(self, goal: np.ndarray) -> Mission:
+        """Pursue the goal that adaptation is for; look for a way to it while nobody has been there (section 3.3)."""
+        nearest = int(self.graph.distances(goal).argmin())
+        unseen = np.linalg.norm(self.graph.centers[nearest] - goal) > self.graph.cover_radius
+        if unseen and self.rng.random() < LOOK_FOR_A_WAY:
+            return self._beyond(nearest, goal)
+        return Mission(goal.copy())
+
+    # -- saving -------------------------------------------------------------------------------------------------------
+
+    def get_state(self) -> dict[str, Any]:
+        """Return the missions as plain data."""
+        current = [None if mission is None else asdict(mission) for mission in self.current]
+        return {"current": current, "pinned": self.pinned}
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Restore what :meth:`get_state` returned."""
+        self.current = [None if spec is None else Mission(**spec) for spec in state["current"]]
+        self.pinned = state["pinned"]

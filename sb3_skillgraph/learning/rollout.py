@@ -1,0 +1,215 @@
+"""One step of learning: act, with noise, towards what the missions want; learn from where that led (Figure 10)."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from stable_baselines3.common.noise import ActionNoise
+
+from sb3_skillgraph.choices import Stance
+from sb3_skillgraph.learning.missions import Mission, Missions
+from sb3_skillgraph.learning.witness import Witness
+from sb3_skillgraph.memory.replay import TransitionStore
+from sb3_skillgraph.planning import DIRECT
+from sb3_skillgraph.runner import Runner, RunnerState
+
+#: Standard deviation of the Gaussian noise on scaled actions, where no ``action_noise`` is given.
+NOISE = 0.1
+#: A random action is held for so many environment steps in the mean: single ones average out.
+HOLD = 10
+
+
+class Step(NamedTuple):
+    """A step between its taking and its storing."""
+
+    observation: dict[str, np.ndarray]
+    action: np.ndarray
+    aims: np.ndarray
+    state: RunnerState
+    held: np.ndarray
+    hold_left: np.ndarray
+    rng_state: Any
+
+
+class Rollout:
+    """What the agent is in the middle of in each environment, while it learns.
+
+    :param runner: runs options
+    :param missions: what the agent is about
+    :param witness: learns from trajectories and runs
+    :param store: receives every transition, once
+    :param random_action_prob: share of the steps, beside explorations, that are random
+    :param rng: random generator
+    """
+
+    def __init__(
+        self,
+        runner: Runner,
+        missions: Missions,
+        witness: Witness,
+        store: TransitionStore,
+        random_action_prob: float,
+        rng: np.random.Generator,
+    ) -> None:
+        self.runner = runner
+        self.missions = missions
+        self.witness = witness
+        self.store = store
+        self.random_action_prob = random_action_prob
+        self.rng = rng
+        self.pending: Step | None = None
+        self.n_stuck = 0  # episodes given up
+        self._forget()
+
+    def begin_anew(self, points: np.ndarray) -> None:
+        """Begin an episode in every environment.
+
+        :param points: where, shape ``(n_envs, goal_dim)``
+        """
+        self._forget()
+        for env, point in enumerate(points):
+            self.begin_episode(env, point)
+
+    def _forget(self) -> None:
+        """Forget what the environments were in the middle of."""
+        n_envs, graph = self.store.n_envs, self.runner.graph
+        self.state = RunnerState.fresh(n_envs, graph.goal_dim)
+        self._held = np.zeros((n_envs, self.store.action_dim), dtype=np.float32)
+        self._hold_left = np.zeros(n_envs, dtype=np.int64)
+        self.pending = None
+        self.store.cut()
+        self.witness.cut(n_envs)
+        self.missions.cut(n_envs)
+
+    def begin_episode(self, env: int, point: np.ndarray) -> None:
+        """An episode begins.
+
+        :param env: in which environment
+        :param point: where, shape ``(goal_dim,)``
+        """
+        self.witness.begin(env, point)
+
+    # -- acting -------------------------------------------------------------------------------------------------------
+
+    def act(self, observation: dict[str, np.ndarray], warm_up: bool, noise: ActionNoise | None) -> np.ndarray:
+        """Choose what to do; nothing is kept until the step is stored.
+
+        :param observation: ``observation`` and ``achieved_goal``, shapes ``(n_envs, dim)``
+        :param warm_up: whether all actions are to be random
+        :param noise: to add; None for Gaussian noise
+        :return: scaled actions, shape ``(n_envs, action_dim)``
+        """
+        rng_state = self.rng.bit_generator.state
+        points = observation["achieved_goal"]
+        missions = [self.missions.of(i, point, warm_up) for i, point in enumerate(points)]
+        state = self._explorers(self.state, missions)
+        goals = np.stack([mission.goal for mission in missions])
+        scaled, state = self.runner.act(observation, goals, state, Stance.OPTIMISTIC)
+        scaled, held, hold_left = self._with_noise(scaled, missions, noise)
+        self.pending = Step(observation, scaled, state.aim, state, held, hold_left, rng_state)
+        return scaled
+
+    def _explorers(self, state: RunnerState, missions: list[Mission]) -> RunnerState:
+        """Send those who explore on towards their point; the option of a random walk runs, but does not act."""
+        idle = [i for i, mission in enumerate(missions) if mission.exploring and not state.option[i]]
+        if not idle:
+            return state
+        state = state.copy()
+        for i in idle:
+            mission = missions[i]
+            state.option[i] = DIRECT
+            state.began[i] = state.arrived[i]
+            state.aim[i] = mission.goal if mission.beyond is None else mission.beyond
+            state.steps[i], state.timeout[i] = 0, mission.explore_steps
+        return state
+
+    def _with_noise(
+        self, scaled: np.ndarray, missions: list[Mission], noise: ActionNoise | None
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Add noise, or replace an action by a random one that is held for some steps."""
+        added = self.rng.normal(0.0, NOISE, scaled.shape) if noise is None else noise()
+        scaled = scaled + added
+        held, hold_left = self._held, self._hold_left.copy()
+        for i, mission in enumerate(missions):
+            if hold_left[i] == 0 and (mission.random_walk or self.rng.random() < self.random_action_prob / HOLD):
+                held = held.copy()
+                held[i] = self.rng.uniform(-1.0, 1.0, held[i].shape)
+                hold_left[i] = self.rng.integers(1, 2 * HOLD)
+            if hold_left[i] > 0:
+                scaled[i] = held[i]
+                hold_left[i] -= 1
+        return np.clip(scaled, -1.0, 1.0).astype(np.float32), held, hold_left
+
+    # -- learning -----------------------------------------------------------------------------------------------------
+
+    def observe(
+        self, reached: dict[str, np.ndarray], terminated: np.ndarray, dones: np.ndarray, stuck: np.ndarray
+    ) -> None:
+        """Store the step once, and let everything learn from it.
+
+        :param reached: the observations that it led to, before any reset, shapes ``(n_envs, dim)``
+        :param terminated: where the environment ended for good, shape ``(n_envs,)``
+        :param dones: where the episode ended for any reason
+        :param stuck: where the agent can do nothing any more
+        """
+        step = self.pending
+        assert step is not None
+        points = reached["achieved_goal"]
+        self.store.add(
+            step.observation["observation"],
+            step.observation["achieved_goal"],
+            reached["observation"],
+            points,
+            step.action,
+            step.aims,
+            terminated,
+            dones,
+            stuck,
+        )
+        self._held, self._hold_left, self.pending = step.held, step.hold_left, None
+        for i in np.flatnonzero(step.state.steps == 1).tolist():
+            self.witness.began(i, step.observation["achieved_goal"][i])
+        self.state, runs = self.runner.advance(step.state, points, stuck)
+        by_env = {run.env: run for run in runs}
+        over = np.zeros(len(points), dtype=bool)
+        for i, point in enumerate(points):
+            if not stuck[i]:
+                self.witness.step(i, point)  # no event is to lie where agents get stuck
+            run, mission = by_env.get(i), self.missions.current[i]
+            assert mission is not None
+            if run is not None and not mission.random_walk:
+                self.witness.ended(run)
+                if mission.exploring and run.success:
+                    self._salient(point)
+            over[i] = self.missions.observe(i, point, run, bool(dones[i]))
+            self.n_stuck += bool(stuck[i])
+        self._hold_left = np.where(dones, 0, self._hold_left)
+        if over.any():
+            self.state = self.state.begun_anew(over)
+
+    def _salient(self, point: np.ndarray) -> None:
+        """A proposed point was reached: it becomes a vertex, where there is none."""
+        graph = self.runner.graph
+        if graph.distances(point).min() > graph.radius:
+            self.witness.add_event(point, salient=True)
+
+    # -- saving -------------------------------------------------------------------------------------------------------
+
+    def get_state(self) -> dict[str, Any]:
+        """Return what the environments are in the middle of, as plain data."""
+        state = {"runner": tuple(self.state), "held": self._held, "hold_left": self._hold_left, "n_stuck": self.n_stuck}
+        return {**state, "missions": self.missions.get_state(), "witness": self.witness.get_state()}
+
+    def set_state(self, state: dict[str, Any], same_envs: bool) -> None:
+        """Restore what :meth:`get_state` returned.
+
+        :param state: the state
+        :param same_envs: whether the environments go on where they were; else they begin anew
+        """
+        self.n_stuck = state["n_stuck"]
+        self.witness.set_state(state["witness"])
+        if not same_envs:
+            self._forget()
+            return
+        self.state = RunnerState(*state["runner"])
+        self._held, self._hold_left = state["held"], state["hold_left"]
+        self.missions.set_state(state["missions"])

@@ -1,0 +1,211 @@
+"""What trajectories and runs teach the graph (DESIGN: evidence): where one has been, what was crossed, how runs ended."""
+
+from typing import Any
+
+import numpy as np
+
+from sb3_skillgraph.choices import ChoiceModel, Stance
+from sb3_skillgraph.graph import NOWHERE, SkillGraph
+from sb3_skillgraph.planning import DIRECT
+from sb3_skillgraph.runner import Run
+from sb3_skillgraph.walk_model import DOUBTFUL, Kind
+
+#: Environment steps between two fits of the model of untried walks.
+FIT_EVERY = 1_000
+#: Runs of walks to goals that are remembered for it, where no edge keeps them.
+N_SAMPLES = 1_000
+#: A failed run has landed far away where that is so many times further than it was to go.
+FAR = 2.0
+#: Failures that nothing is known of, in the share that land far away: few say little.
+FAR_PRIOR = 2.0
+#: Columns of the samples: distance (event radii), whether the goal's event was where it began, success, steps.
+_COLUMNS = 4
+
+
+class _Stay:
+    """A stretch of a trajectory within one event: when it was nearest to the event's centre."""
+
+    def __init__(self, event: int, step: int, distance: float) -> None:
+        self.event, self.step, self.distance = event, step, distance
+
+    def note(self, step: int, distance: float) -> None:
+        if distance < self.distance:
+            self.step, self.distance = step, distance
+
+
+class Witness:
+    """Watches one trajectory per environment, and writes into the graph what is learned from it.
+
+    Steps are counted for each environment by itself. Nothing is kept that grows with experience.
+
+    :param graph: the skill graph
+    :param choice_model: what is expected of options so far, and the model of untried walks
+    :param walk_steps: environment steps within which a crossing from one event to another makes an edge
+    :param n_envs: number of environments
+    """
+
+    def __init__(self, graph: SkillGraph, choice_model: ChoiceModel, walk_steps: int, n_envs: int) -> None:
+        self.graph = graph
+        self.choice_model = choice_model
+        self.walk_steps = walk_steps
+        self._samples = np.zeros((N_SAMPLES, _COLUMNS))
+        self._n_samples = 0
+        self._n_steps = 0  # of all environments, since the last fit
+        self.cut(n_envs)
+
+    def cut(self, n_envs: int) -> None:
+        """Forget what the environments were in the middle of.
+
+        :param n_envs: number of environments from now on
+        """
+        self._stays: list[list[_Stay]] = [[] for _ in range(n_envs)]
+        self._step = [0] * n_envs
+        self._began = np.zeros((n_envs, self.graph.goal_dim))
+
+    # -- trajectories -------------------------------------------------------------------------------------------------
+
+    def begin(self, env: int, point: np.ndarray) -> None:
+        """A trajectory begins.
+
+        :param env: which environment
+        :param point: where, shape ``(goal_dim,)``
+        """
+        self._stays[env], self._step[env] = [], 0
+        self._pass(env, point)
+
+    def step(self, env: int, point: np.ndarray) -> None:
+        """A trajectory goes on.
+
+        :param env: which environment
+        :param point: where it has got to, shape ``(goal_dim,)``
+        """
+        self._step[env] += 1
+        self._n_steps += 1
+        self._pass(env, point)
+        if self._n_steps >= FIT_EVERY:
+            self._n_steps = 0
+            self.fit()
+
+    def _pass(self, env: int, point: np.ndarray) -> None:
+        """Note in which event the trajectory is; a place that belongs to none becomes a landmark."""
+        event = self.graph.locate(point)
+        if event == NOWHERE:
+            event = self.add_event(point, salient=False)
+        stays, step = self._stays[env], self._step[env]
+        distance = float(np.linalg.norm(self.graph.centers[event] - point))
+        if stays and stays[-1].event == event:
+            stays[-1].note(step, distance)
+            return
+        if stays:
+            self._left(env)
+        self.graph.visits[event] += 1
+        self._stays[env].append(_Stay(event, step, distance))
+
+    def _left(self, env: int) -> None:
+        """A stay is over: every event that was passed shortly before has been crossed from."""
+        *earlier, last = self._stays[env]
+        recent = [stay for stay in earlier if last.step - stay.step <= self.walk_steps]
+        seen = set()
+        for stay in reversed(recent):
+            if stay.event != last.event and stay.event not in seen:
+                seen.add(stay.event)  # only the last time it was passed: a detour is no way
+                self.graph.crossed(stay.event, last.event, max(last.step - stay.step, 1))
+        for event in (*seen, last.event) if seen else ():
+            self._bound_degree(event)
+        self._stays[env] = [*recent, last]
+
+    def _bound_degree(self, event: int) -> None:
+        if self.graph.degree(event) > self.graph.max_degree:
+            success = self.choice_model.evidence().success(Stance.EXPECTED)
+            distance = self.choice_model.kinds().distance
+            self.graph.bound_degree(event, success * (1.0 + distance))
+
+    def add_event(self, point: np.ndarray, *, salient: bool) -> int:
+        """Add an event to the graph, which coarsens its cover where it is full.
+
+        :param point: its centre, shape ``(goal_dim,)``
+        :param salient: whether it is a target of its own
+        :return: its index
+        """
+        while len(self.graph.events) >= self.graph.max_events:
+            new_index = self.graph.coarsen()
+            for stays in self._stays:
+                for stay in stays:
+                    stay.event = int(new_index[stay.event])
+            located = self.graph.locate(point)
+            if located != NOWHERE:
+                return located
+        return self.graph.add_event(point, salient=salient)
+
+    # -- runs ---------------------------------------------------------------------------------------------------------
+
+    def began(self, env: int, point: np.ndarray) -> None:
+        """A run begins.
+
+        :param env: which environment
+        :param point: where, shape ``(goal_dim,)``
+        """
+        self._began[env] = point
+
+    def ended(self, run: Run) -> None:
+        """A run has ended: its record goes to the edge it belongs to, or, to a goal, to the model of untried walks."""
+        graph = self.graph
+        source, target = graph.index(run.event), graph.index(run.option)
+        if source != NOWHERE and target != NOWHERE and source != target:
+            if graph.edges.find(source, target) is not None:
+                graph.ran(source, target, run.success, graph.index(run.landing), run.steps)
+            return
+        if run.option == DIRECT:
+            distance = float(np.linalg.norm(run.aim - self._began[run.env])) / graph.radius
+            at_home = source != NOWHERE and graph.locate(run.aim) == source
+            row = self._n_samples % N_SAMPLES
+            self._samples[row] = distance, at_home, run.success, run.steps
+            self._n_samples += 1
+
+    def fit(self) -> None:
+        """Learn what to expect of untried walks from all runs so far."""
+        graph, edges, model = self.graph, self.graph.edges, self.choice_model.model
+        aging = graph.aging()
+        samples = self._samples[: min(self._n_samples, N_SAMPLES)]
+        distance, at_home, success, steps = samples.T
+        kinds = self.choice_model.kinds()
+        direct = Kind(distance, at_home * distance * model.steps_per_radius, at_home, np.zeros(len(samples)))
+        model.fit(
+            Kind(*(np.concatenate(columns) for columns in zip(kinds, direct, strict=True))),
+            np.concatenate([edges.successes * aging, success]),
+            np.concatenate([edges.failures * aging, 1.0 - success]),
+            np.concatenate([edges.success_steps * aging, success * steps]),
+        )
+        self._learn_loss(kinds)
+
+    def _learn_loss(self, kinds: Kind) -> None:
+        """Learn which share of failures lands far away, for doubtful walks and for others."""
+        graph, edges, model = self.graph, self.graph.edges, self.choice_model.model
+        # With one entry more than there are events: NOWHERE is infinitely far away.
+        centers = np.concatenate([graph.centers, np.full((1, graph.goal_dim), np.inf)])
+        away = np.linalg.norm(centers[edges.landing] - graph.centers[edges.source][:, None], axis=2) / graph.radius
+        far = away > FAR * (kinds.distance[:, None] + 1.0)
+        doubtful = model.success(kinds) < DOUBTFUL
+        weight = edges.landing_weight * graph.aging()[:, None]
+        for i, rows in enumerate((doubtful, ~doubtful)):
+            model.loss[i] = (weight * far)[rows].sum() / (weight[rows].sum() + FAR_PRIOR)
+
+    # -- saving -------------------------------------------------------------------------------------------------------
+
+    def get_state(self) -> dict[str, Any]:
+        """Return everything as plain data."""
+        return {
+            "samples": self._samples[: min(self._n_samples, N_SAMPLES)].copy(),
+            "n_samples": self._n_samples,
+            "n_steps": self._n_steps,
+            "stays": [[[stay.event, stay.step, stay.distance] for stay in stays] for stays in self._stays],
+            "step": list(self._step),
+            "began": self._began,
+        }
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Restore what :meth:`get_state` returned."""
+        self._n_samples, self._n_steps = state["n_samples"], state["n_steps"]
+        self._samples[: len(state["samples"])] = state["samples"]
+        self._stays = [[_Stay(*stay) for stay in stays] for stays in state["stays"]]
+        self._step, self._began = list(state["step"]), np.array(state["began"])

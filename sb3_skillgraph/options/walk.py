@@ -1,0 +1,42 @@
+"""Walks: the options that share one goal-conditioned policy, the walker."""
+
+
+import numpy as np
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+
+from sb3_skillgraph.events import Event
+
+
+class Walk:
+    """An option whose policy is the walker, given one event as its goal (section 2.1).
+
+    Its initiation set are the events from which it has been seen to be possible: in the graph, those with an edge to it.
+
+    :param id: its name, and that of its vertex in the skill graph
+    :param target: id of the event it leads to
+    :param termination: the event it leads to, where it ends
+    :param learner: the SB3 model of the walker, which all walks share
+    """
+
+    def __init__(self, id: str, termination: Event, learner: OffPolicyAlgorithm) -> None:
+        self.id = id
+        self.target = termination.id
+        self.termination = termination
+        self.learner = learner
+
+    def __repr__(self) -> str:
+        return f"<walk {self.id} to {self.target}>"
+
+    @property
+    def subgoal(self) -> np.ndarray:
+        """The point it aims at, shape ``(goal_dim,)``."""
+        return self.termination.center
+
+    def contains(self, points: np.ndarray) -> np.ndarray:
+        """Tell at which points it has succeeded.
+
+        :param points: shape ``(n, goal_dim)``
+        :return: bool array of shape ``(n,)``
+        """
+        return self.termination.contains(points)
+

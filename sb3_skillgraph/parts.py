@@ -1,0 +1,212 @@
+"""The parts of an agent, and how they are put together (Figure 10)."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from stable_baselines3 import DDPG, SAC, TD3
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_skillgraph.goal_env import GoalSpec, Oracle, env_attribute, find_view
+from sb3_skillgraph.graph import SkillGraph
+from sb3_skillgraph.learning.dco import DCOSalience
+from sb3_skillgraph.learning.missions import Missions
+from sb3_skillgraph.learning.rollout import Rollout
+from sb3_skillgraph.learning.salience import FrontierSalience, RandomSalience, Salience
+from sb3_skillgraph.learning.witness import Witness
+from sb3_skillgraph.memory.replay import TransitionStore
+from sb3_skillgraph.options.factory import OptionFactory
+from sb3_skillgraph.options.learner import OptionDDPG, OptionLearner, OptionTD3
+from sb3_skillgraph.options.option import Option
+from sb3_skillgraph.options.views import ScaledView
+from sb3_skillgraph.planning import Planner
+from sb3_skillgraph.runner import Runner
+from sb3_skillgraph.walk_model import WalkModel
+
+NET_ARCH = [128, 128]  # of the walker's networks
+#: Weight, in the loss of ``OptionDDPG``'s and ``OptionTD3``'s actors, of the mean squared norm of what their tanh is given:
+#: keeps them from getting stuck at the bounds of the actions (success on Medium 0.96 with it, 0.61 without).
+SATURATION_PENALTY = 1e-4
+#: Environment steps within which a goal is to be reached, where the environment names no time limit.
+HORIZON = 1_000
+#: Steps ahead from which hindsight draws achieved goals.
+HINDSIGHT_STEPS = 200
+OPTION_CLASSES: dict[str, type[OffPolicyAlgorithm]] = {
+    cls.__name__: cls for cls in (OptionDDPG, OptionTD3, DDPG, TD3, SAC)
+}
+
+
+@dataclass
+class Parts:
+    """What a :class:`~sb3_skillgraph.SkillGraphAgent` is made of; each part knows those above it only."""
+
+    rng: np.random.Generator
+    view_name: str | None
+    factory: OptionFactory
+    store: TransitionStore
+    walker: Option
+    graph: SkillGraph
+    model: WalkModel
+    planner: Planner
+    runner: Runner
+    missions: Missions
+    witness: Witness
+    rollout: Rollout
+
+    @classmethod
+    def build(cls, agent: OffPolicyAlgorithm, spec: GoalSpec, arguments: dict[str, Any]) -> "Parts":
+        """Put an agent together.
+
+        :param agent: gives environment, spaces, SB3's arguments and device
+        :param spec: lengths of observation, goal and action
+        :param arguments: the agent's keyword arguments
+        """
+        check_numbers(arguments)
+        rng = np.random.default_rng(agent.seed)
+        radius = _event_radius(arguments["event_radius"], agent.env)
+        view_name, function = find_view(arguments["option_view"], agent.env, spec)
+        view = ScaledView(function, radius)
+        store = TransitionStore(agent.buffer_size, spec.observation_dim, spec.goal_dim, spec.action_dim, agent.n_envs)
+        factory = OptionFactory(
+            option_class(arguments["option_class"]),
+            _option_kwargs(agent, arguments),
+            store,
+            view,
+            _box(agent.action_space),
+            radius,
+            arguments["goal_tolerance"] * radius,
+            rng,
+            {"hindsight": arguments["hindsight"], "horizon": HINDSIGHT_STEPS},
+            agent.device,
+            arguments["shaping"],
+        )
+        walker = factory.make("walker", None, None)
+        graph, model = SkillGraph(spec.goal_dim, radius, arguments["max_events"]), WalkModel()
+        planner = Planner(graph, model, _horizon(agent.env))
+        runner = Runner(graph, planner, walker.actor, view)
+        salience = _salience(arguments, graph, store, agent)
+        missions = Missions(
+            graph,
+            salience,
+            arguments["explore_prob"],
+            arguments["exploration_steps"],
+            arguments["explore_beyond"],
+            rng,
+        )
+        witness = Witness(graph, planner.choice_model, arguments["walk_steps"], agent.n_envs)
+        rollout = Rollout(runner, missions, witness, store, arguments["random_action_prob"], rng)
+        return cls(
+            rng, view_name, factory, store, walker, graph, model, planner, runner, missions, witness, rollout
+        )
+
+    def unscale(self, scaled: np.ndarray) -> np.ndarray:
+        """Turn actions in [-1, 1], shape ``(n, action_dim)``, into the environment's own bounds."""
+        return self.factory.unscale(scaled)
+
+
+def option_class(given: type[OffPolicyAlgorithm] | str) -> type[OffPolicyAlgorithm]:
+    """Return a class of options' policies, which may be given by name.
+
+    :raises ValueError: if it is none
+    """
+    if isinstance(given, str) and given in OPTION_CLASSES:
+        return OPTION_CLASSES[given]
+    if isinstance(given, type) and issubclass(given, OffPolicyAlgorithm):
+        return given
+    raise ValueError(f"option_class is {given!r}: it must be an SB3 off-policy class, or one of {', '.join(OPTION_CLASSES)}.")
+
+
+_RANGES: dict[str, tuple[float, float]] = {
+    "learning_starts": (0, np.inf),
+    "buffer_size": (1, np.inf),
+    "batch_size": (1, np.inf),
+    "tau": (0, 1),
+    "gamma": (0, 1),
+    "gradient_steps": (-1, np.inf),
+    "max_events": (8, np.inf),
+    "walk_steps": (1, np.inf),
+    "explore_prob": (0, 1),
+    "exploration_steps": (1, np.inf),
+    "explore_beyond": (0, np.inf),
+    "random_action_prob": (0, 1),
+    "hindsight": (0, 1),
+    "goal_tolerance": (1e-6, 1),
+    "shaping": (0, np.inf),
+}
+
+
+def check_numbers(arguments: dict[str, Any]) -> None:
+    """Refuse numbers out of range.
+
+    :param arguments: the agent's keyword arguments
+    :raises ValueError: naming the argument and its range
+    """
+    for name, (low, high) in _RANGES.items():
+        value = arguments[name]
+        if isinstance(value, bool) or not isinstance(value, int | float | np.number) or not low <= value <= high:
+            raise ValueError(f"{name} must be a number from {low:g} to {high:g}, not {value!r}.")
+
+
+def _box(space: spaces.Space) -> spaces.Box:
+    assert isinstance(space, spaces.Box)
+    return space
+
+
+def _event_radius(given: float | None, env: VecEnv | None) -> float:
+    radius: Any = given
+    for name in ("success_radius", "distance_threshold"):
+        if radius is None and env is not None:
+            radius = env_attribute(env, name)
+    if radius is None:
+        raise ValueError(
+            "event_radius is required: the environment has neither a success_radius nor a distance_threshold to take "
+            "it from. Give the distance, in goal units, within which a goal counts as reached."
+        )
+    if not (np.isscalar(radius) and 0 < float(radius) < np.inf):  # type: ignore[arg-type]
+        raise ValueError(f"event_radius must be a positive number, not {radius!r}.")
+    return float(radius)
+
+
+def _horizon(env: VecEnv | None) -> int:
+    """Return the environment's time limit, by the names in use."""
+    if env is not None:
+        for name in ("max_steps", "_max_episode_steps"):
+            limit = env_attribute(env, name)
+            if limit:
+                return int(limit)
+    return HORIZON
+
+
+def _option_kwargs(agent: OffPolicyAlgorithm, arguments: dict[str, Any]) -> dict[str, Any]:
+    cls = option_class(arguments["option_class"])
+    kwargs: dict[str, Any] = dict(
+        gamma=agent.gamma, tau=agent.tau, policy_kwargs={"net_arch": NET_ARCH, **agent.policy_kwargs}
+    )
+    if issubclass(cls, OptionLearner):
+        if callable(agent.learning_rate):
+            raise ValueError(f"{cls.__name__} takes constant learning rates; for a schedule use option_class=TD3 or SAC.")
+        kwargs.update(actor_learning_rate=agent.learning_rate, critic_learning_rate=agent.learning_rate)
+        kwargs.update(saturation_penalty=SATURATION_PENALTY)
+    else:
+        kwargs.update(learning_rate=agent.learning_rate)
+    return {**kwargs, **(arguments["option_kwargs"] or {})}
+
+
+def _salience(arguments: dict[str, Any], graph: SkillGraph, store: TransitionStore, agent: OffPolicyAlgorithm) -> Salience:
+    salience = arguments["salience"]
+    if salience == "frontier":
+        return FrontierSalience(graph)
+    if salience == "dco":
+        return DCOSalience(store, graph, arguments["walk_steps"])
+    if salience == "rrt":
+        return RandomSalience(Oracle(agent.get_env))
+    if not hasattr(salience, "propose"):
+        raise ValueError(
+            f"Unknown salience {salience!r}: use 'frontier', 'rrt', 'dco' or an object with a method propose(rng) that "
+            "returns a point of goal space."
+        )
+    return salience
+
+

@@ -1,0 +1,84 @@
+"""A plan as it is shown to people (section 3.3, Figure 2)."""
+
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from sb3_skillgraph.choices import Stance
+from sb3_skillgraph.graph import NOWHERE
+from sb3_skillgraph.planning import DIRECT, GOAL, Solution
+from sb3_skillgraph.runner import Runner, RunnerState
+
+Status = Literal["on_graph", "in_initiation", "off_graph"]
+
+
+class Plan(NamedTuple):
+    """How the agent goes about a goal.
+
+    :param status: the paper's three cases: ``on_graph``, the goal lies where an option has been seen to end, in an event;
+        ``in_initiation``, near enough to an event to belong to it; ``off_graph``, where the agent has never been
+    :param path: ids of vertices: the option that runs first, where it leads, the option from there, ..., ``"goal"``
+    :param expected_steps: environment steps to the goal, if it is reached
+    :param success_probability: that it is reached within the horizon, failures and replanning included
+    """
+
+    status: Status
+    path: tuple[str, ...]
+    expected_steps: float
+    success_probability: float
+
+    def __str__(self) -> str:
+        walks = [vertex for vertex in self.path[1:-1:2]]
+        by_way = f" by way of {', '.join(walks)}" if walks else " straight on"
+        known = {
+            "on_graph": "The goal lies in an event",
+            "in_initiation": "The goal lies beside an event",
+            "off_graph": "The goal lies where the agent has never been",
+        }[self.status]
+        steps = f"about {self.expected_steps:.0f} steps" if np.isfinite(self.expected_steps) else "no telling when"
+        return f"{known}: go there{by_way}, {steps}, success {self.success_probability:.0%}."
+
+
+def describe(runner: Runner, state: RunnerState, point: np.ndarray, goal: np.ndarray, stance: Stance) -> Plan:
+    """Make the plan that the runner follows.
+
+    :param runner: runs options
+    :param state: of one environment, advanced to this step
+    :param point: where the agent stands, shape ``(goal_dim,)``
+    :param goal: shape ``(goal_dim,)``
+    :param stance: what the plan counts on
+    :return: the plan; its first option is the one that runs, or would be begun
+    """
+    start = runner.start(state, 0, point)
+    planner, runs = runner.planner, runner.runs(state, 0)
+    solution = planner.solve(start, goal.astype(np.float64), runs, stance)
+    first = _running(runner, state, solution) if state.option[0] else solution.first()
+    rows = planner.path(solution, first)
+    remaining = max(planner.horizon - float(state.elapsed[0]), 1.0)
+    probability, steps = planner.promise(start, goal.astype(np.float64), runs, solution, first, remaining)
+    return Plan(_status(runner, goal), _ids(runner, solution, rows), steps, probability)
+
+
+def _running(runner: Runner, state: RunnerState, solution: Solution) -> int:
+    """Return the choice at the start that stands for the running option."""
+    option = str(state.option[0])
+    target = solution.goal if option == DIRECT else runner.graph.index(option)
+    at_start = solution.choices.source == solution.start
+    rows = np.flatnonzero(at_start & (solution.choices.target == target))
+    return int(rows[0]) if len(rows) else solution.first()
+
+
+def _ids(runner: Runner, solution: Solution, rows: list[int]) -> tuple[str, ...]:
+    graph, ids = runner.graph, []
+    for row in rows:
+        target = int(solution.choices.target[row])
+        ids += [DIRECT, GOAL] if target == solution.goal else [graph.walk_ids[target], graph.events[target].id]
+    return tuple(ids)
+
+
+def _status(runner: Runner, goal: np.ndarray) -> Status:
+    graph = runner.graph
+    home = graph.locate(goal)
+    if home == NOWHERE:
+        return "off_graph"
+    return "on_graph" if graph.events[home].holds(goal) else "in_initiation"

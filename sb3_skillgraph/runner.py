@@ -1,0 +1,226 @@
+"""Running options, one environment step at a time: the same in ``learn`` and in ``predict`` (sections 3.2.4, A.6)."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from sb3_skillgraph.choices import Runs, Stance, Start
+from sb3_skillgraph.graph import NOWHERE, SkillGraph
+from sb3_skillgraph.options.numpy_actor import NumpyActor
+from sb3_skillgraph.options.views import View
+from sb3_skillgraph.planning import DIRECT, GOAL, Planner, Solution, timeout
+
+#: Different runs of an episode that are told apart; more are counted with others that began with the same option.
+MAX_RUNS = 256
+ID = "U16"  # NumPy's type of ids
+
+
+class RunnerState(NamedTuple):
+    """All that must be remembered between two steps, as plain arrays with one entry for each environment.
+
+    States are never changed in place: the one before and the one after a step may share arrays.
+
+    :param option: id of the running option, empty if none runs; shape ``(n_envs,)`` like all but the runs
+    :param began: id of the event it began in, empty if in none
+    :param aim: where it walks to, shape ``(n_envs, goal_dim)``
+    :param steps: environment steps it has run
+    :param timeout: environment steps it may run
+    :param arrived: id of the event that the last option has led to, where the next one begins; empty after a failure
+    :param elapsed: environment steps of the episode so far
+    :param run_event: the episode's runs: where they began, shape ``(n_envs, MAX_RUNS)`` like all that follow
+    :param run_option: which option it was, empty where there is no run
+    :param run_landing: in which event it ended, or ``goal``
+    :param run_success: whether it reached its termination set
+    :param run_steps: the environment steps they took together
+    :param run_count: how many there were of the same kind
+    """
+
+    option: np.ndarray
+    began: np.ndarray
+    aim: np.ndarray
+    steps: np.ndarray
+    timeout: np.ndarray
+    arrived: np.ndarray
+    elapsed: np.ndarray
+    run_event: np.ndarray
+    run_option: np.ndarray
+    run_landing: np.ndarray
+    run_success: np.ndarray
+    run_steps: np.ndarray
+    run_count: np.ndarray
+
+    @classmethod
+    def fresh(cls, n_envs: int, goal_dim: int) -> "RunnerState":
+        """Return the state at the start of an episode."""
+        ids, numbers = np.zeros(n_envs, dtype=ID), np.zeros(n_envs)
+        run_ids, run_numbers = np.zeros((n_envs, MAX_RUNS), dtype=ID), np.zeros((n_envs, MAX_RUNS))
+        running = (ids, ids, np.zeros((n_envs, goal_dim), dtype=np.float32), numbers, numbers, ids, numbers)
+        return cls(*running, run_ids, run_ids, run_ids, run_numbers.astype(bool), run_numbers, run_numbers)
+
+    def begun_anew(self, where: np.ndarray) -> "RunnerState":
+        """Return a state that is fresh for some environments.
+
+        :param where: for which, bool array of shape ``(n_envs,)``
+        """
+        fresh = RunnerState.fresh(len(where), self.aim.shape[1])
+        pairs = zip(fresh, self, strict=True)
+        return RunnerState(*(np.where(where.reshape(-1, *[1] * (new.ndim - 1)), new, old) for new, old in pairs))
+
+    def copy(self) -> "RunnerState":
+        """Return a copy that shares no memory."""
+        return RunnerState(*(array.copy() for array in self))
+
+
+@dataclass(frozen=True)
+class Run:
+    """The end of one run of an option.
+
+    :param env: which environment
+    :param event: id of the event it began in, empty if in none
+    :param option: id of the option
+    :param landing: id of the event it ended in, ``goal`` for the goal, empty for none
+    :param success: whether it reached its termination set
+    :param steps: environment steps it took
+    :param aim: where it walked to, shape ``(goal_dim,)``
+    """
+
+    env: int
+    event: str
+    option: str
+    landing: str
+    success: bool
+    steps: int
+    aim: np.ndarray
+
+
+class Runner:
+    """Lets the first option of the plan run, and plans anew when it has ended.
+
+    It keeps nothing between calls: what must be remembered travels in :class:`RunnerState`.
+
+    :param graph: the skill graph
+    :param planner: plans over it
+    :param actor: the walker's policy
+    :param view: what a policy sees
+    """
+
+    def __init__(self, graph: SkillGraph, planner: Planner, actor: NumpyActor, view: View) -> None:
+        self.graph = graph
+        self.planner = planner
+        self.actor = actor
+        self.view = view
+
+    # -- one step -----------------------------------------------------------------------------------------------------
+
+    def advance(self, state: RunnerState, points: np.ndarray, stuck: Sequence[bool] | None = None) -> tuple[RunnerState, list[Run]]:
+        """End the options that have reached their termination set, have timed out, or whose agent is stuck.
+
+        :param state: the state after the step
+        :param points: where the agents stand, shape ``(n_envs, goal_dim)``
+        :param stuck: which agents can do nothing any more; None for none
+        :return: the state, and one run per option that has ended
+        """
+        runs = []
+        for i, option in enumerate(state.option.tolist()):
+            if not option:
+                continue
+            lost = stuck is not None and bool(stuck[i])
+            arrived = not lost and self._arrived(option, state.aim[i], points[i])
+            if arrived or lost or state.steps[i] >= state.timeout[i]:
+                runs.append(self._run(state, i, points[i], arrived, lost))
+        if runs:
+            state = state.copy()
+            for run in runs:
+                self._end(state, run)
+        return state, runs
+
+    def _arrived(self, option: str, aim: np.ndarray, point: np.ndarray) -> bool:
+        return math.dist(point.tolist(), aim.tolist()) <= self.graph.radius
+
+    def _run(self, state: RunnerState, i: int, point: np.ndarray, arrived: bool, lost: bool) -> Run:
+        option = str(state.option[i])
+        if arrived:
+            landing = GOAL if option == DIRECT else self.graph.id(self.graph.index(option))
+        else:
+            landing = "" if lost else self.graph.id(self.graph.locate(point))
+        return Run(i, str(state.began[i]), option, landing, arrived, int(state.steps[i]), state.aim[i].copy())
+
+    def _end(self, state: RunnerState, run: Run) -> None:
+        """Write a run into the record of the episode, in place."""
+        i = run.env
+        state.option[i] = ""
+        state.arrived[i] = run.landing if run.success and run.landing != GOAL else ""
+        known = state.run_option[i] == run.option
+        same = known & (state.run_event[i] == run.event) & (state.run_landing[i] == run.landing)
+        same &= state.run_success[i] == run.success
+        free = state.run_option[i] == ""
+        # Where the record is full the run counts with others of its option, or else with the rarest.
+        for candidates in (same, free, known):
+            if candidates.any():
+                slot = int(candidates.argmax())
+                break
+        else:
+            slot = int(state.run_count[i].argmin())
+        if not state.run_option[i, slot]:
+            state.run_event[i, slot], state.run_option[i, slot] = run.event, run.option
+            state.run_landing[i, slot], state.run_success[i, slot] = run.landing, run.success
+        state.run_steps[i, slot] += run.steps
+        state.run_count[i, slot] += 1
+
+    def act(
+        self, observation: dict[str, np.ndarray], goals: np.ndarray, state: RunnerState, stance: Stance = Stance.PESSIMISTIC
+    ) -> tuple[np.ndarray, RunnerState]:
+        """Begin an option where none is running, and let the options act.
+
+        :param observation: ``observation`` and ``achieved_goal``, shapes ``(n_envs, dim)``
+        :param goals: where the agents are to go, shape ``(n_envs, goal_dim)``
+        :param state: the state before the step
+        :param stance: what plans count on
+        :return: actions scaled to [-1, 1], shape ``(n_envs, action_dim)``, and the state after the step
+        """
+        points = observation["achieved_goal"]
+        idle = np.flatnonzero(state.option == "").tolist()
+        if idle:
+            state = state.copy()
+        for i in idle:
+            start = self.start(state, i, points[i])
+            self.begin(state, i, self.decide(state, i, start, goals[i], stance), start, goals[i])
+        actions = self.actor.act(self.view(observation["observation"], points, state.aim))
+        return actions, state._replace(steps=state.steps + 1, elapsed=state.elapsed + 1)
+
+    # -- choosing an option -------------------------------------------------------------------------------------------
+
+    def start(self, state: RunnerState, i: int, point: np.ndarray) -> Start:
+        """Return where the next option of an environment begins: in the event arrived at, or the one it belongs to."""
+        event = self.graph.index(str(state.arrived[i]))
+        return Start(point.astype(np.float64), self.graph.locate(point) if event == NOWHERE else event)
+
+    def decide(self, state: RunnerState, i: int, start: Start, goal: np.ndarray, stance: Stance) -> Solution:
+        """Plan for one environment."""
+        return self.planner.solve(start, goal.astype(np.float64), self.runs(state, i), stance)
+
+    def begin(self, state: RunnerState, i: int, solution: Solution, start: Start, goal: np.ndarray) -> None:
+        """Begin the first option of a plan, in place."""
+        first = solution.first()
+        target = int(solution.choices.target[first])
+        if target == solution.goal:
+            state.option[i], state.aim[i] = DIRECT, goal
+        else:
+            state.option[i], state.aim[i] = self.graph.walk_ids[target], self.graph.centers[target]
+        state.began[i] = self.graph.id(start.event)
+        state.steps[i], state.timeout[i] = 0, timeout(float(solution.choices.steps[first]))
+
+    def runs(self, state: RunnerState, i: int) -> Runs:
+        """Return the episode's runs of one environment as the planner takes them; those of forgotten events are left out."""
+        used = np.flatnonzero(state.run_option[i] != "").tolist()
+        index, n_events, rows = self.graph.index, len(self.graph.events), []
+        for slot in used:
+            option, success = str(state.run_option[i, slot]), bool(state.run_success[i, slot])
+            target = n_events if option == DIRECT else index(option)
+            if target != NOWHERE:
+                source, end = index(str(state.run_event[i, slot])), index(str(state.run_landing[i, slot]))
+                rows.append((source, target, success, end, int(state.run_count[i, slot])))
+        return Runs(*np.array(rows, dtype=np.int64).reshape(-1, 5).T)

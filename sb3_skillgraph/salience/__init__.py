@@ -1,1 +1,0 @@
-"""Salient events: how they are proposed, filtered and chosen as targets."""
