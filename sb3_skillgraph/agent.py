@@ -78,9 +78,7 @@ class SkillGraphAgent(OffPolicyAlgorithm):
     :param salience: how events to pursue are proposed: ``"frontier"`` (uniform points around what has been visited),
         ``"rrt"`` (uniform feasible states from the environment's ``sample_free``), ``"dco"`` (the two ends of a learned
         Fiedler vector) or an object with ``propose(rng)`` [3.2.1]
-    :param explore_prob: probability that a mission explores: to the event nearest to a proposed point, and on from there;
-        the others travel to any event
-    :param exploration_steps: environment steps of such an exploration
+    :param exploration_steps: environment steps for which an exploration goes on without finding anything new
     :param explore_beyond: event radii that an exploration towards a point goes on past it
     :param random_action_prob: share of the steps on the way that are random
     :param hindsight: share of sampled transitions relabelled with a goal achieved later
@@ -119,7 +117,6 @@ class SkillGraphAgent(OffPolicyAlgorithm):
         max_events: int = 500,
         walk_steps: int = 40,
         salience: Literal["frontier", "rrt", "dco"] | Salience = "frontier",
-        explore_prob: float = 0.5,
         exploration_steps: int = 100,
         explore_beyond: float = 0.0,
         random_action_prob: float = 0.1,

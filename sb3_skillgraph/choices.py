@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sb3_skillgraph.graph import NOWHERE, SkillGraph
-from sb3_skillgraph.walk_model import DOUBTFUL, Kind, WalkModel
+from sb3_skillgraph.walk_model import Kind, WalkModel
 
 #: Runs that the model's guess counts for, beside those that there were.
 GUESS_RUNS = 2.0
@@ -92,6 +92,7 @@ class Evidence(NamedTuple):
     :param successes: weight of the runs that succeeded
     :param failures: weight of those that failed
     :param steps: environment steps of a successful run
+    :param loss: share of the failures of their kind that end far away
     :param landing: events in which failed runs landed
     :param weight: weight of those
     """
@@ -100,6 +101,7 @@ class Evidence(NamedTuple):
     successes: np.ndarray
     failures: np.ndarray
     steps: np.ndarray
+    loss: np.ndarray
     landing: np.ndarray
     weight: np.ndarray
 
@@ -160,7 +162,11 @@ class ChoiceModel:
         # A guess of the steps counts for one run.
         steps = (self.model.steps(kinds) + edges.success_steps * aging) / (1.0 + successes)
         weight = edges.landing_weight * aging[:, None]
-        return Evidence(self.model.success(kinds), successes, failures, steps, edges.landing, weight)
+        loss = self._loss(kinds)
+        return Evidence(self.model.success(kinds), successes, failures, steps, loss, edges.landing, weight)
+
+    def _loss(self, kinds: Kind) -> np.ndarray:
+        return np.where(self.model.is_hasty(kinds), self.model.loss[0], self.model.loss[1])
 
     def _walks(self, runs: Runs, stance: Stance) -> Choices:
         evidence, edges = self.evidence(), self.graph.edges
@@ -179,8 +185,7 @@ class ChoiceModel:
 
     def _choices(self, source: np.ndarray, target: np.ndarray, evidence: Evidence, stance: Stance) -> Choices:
         """Return choices whose failures land where they did, and besides as those of their kind do."""
-        doubtful = evidence.guess < DOUBTFUL
-        loss = np.where(doubtful, self.model.loss[0], self.model.loss[1])
+        loss = evidence.loss
         # One failure's worth of the kind: near where it began, or lost.
         share = np.concatenate([evidence.weight, (1.0 - loss)[:, None], loss[:, None]], axis=1)
         share /= share.sum(axis=1, keepdims=True)
@@ -239,7 +244,13 @@ class ChoiceModel:
         landing = np.full((n, self.graph.edges.landing.shape[1]), NOWHERE)
         none = np.zeros(n)
         evidence = Evidence(
-            self.model.success(kind), none, none.copy(), self.model.steps(kind), landing, np.zeros(landing.shape)
+            self.model.success(kind),
+            none,
+            none.copy(),
+            self.model.steps(kind),
+            self._loss(kind),
+            landing,
+            np.zeros(landing.shape),
         )
         targets = np.broadcast_to(np.asarray(target), (n,)).copy()
         for i, (begin, end) in enumerate(zip(event.tolist(), targets.tolist(), strict=True)):

@@ -13,7 +13,7 @@ NOWHERE = -1
 #: Landmarks lie at least so many event radii apart: 1.5 to 3 make the same agent, fewer make plans cheaper.
 SPACING = 1.5
 #: Edges out of an event, at most; a plan looks at all of them.
-MAX_DEGREE = 16
+MAX_DEGREE = 24
 #: Different events in which failed runs of one edge have landed that are told apart.
 MAX_LANDINGS = 4
 #: Half of its training ago the walker was another one: what ran then counts half as much, to this power.

@@ -90,7 +90,6 @@ class Parts:
         missions = Missions(
             graph,
             salience,
-            arguments["explore_prob"],
             arguments["exploration_steps"],
             arguments["explore_beyond"],
             rng,
@@ -127,7 +126,6 @@ _RANGES: dict[str, tuple[float, float]] = {
     "gradient_steps": (-1, np.inf),
     "max_events": (8, np.inf),
     "walk_steps": (1, np.inf),
-    "explore_prob": (0, 1),
     "exploration_steps": (1, np.inf),
     "explore_beyond": (0, np.inf),
     "random_action_prob": (0, 1),

@@ -18,7 +18,7 @@ LOST_HORIZONS = 10.0
 #: Environment steps by which values may still change when value iteration ends; sweeps, at most.
 PRECISION, MAX_SWEEPS = 0.5, 300
 #: Bins of time in which the success within the horizon is worked out.
-TIME_BINS = 50
+TIME_BINS = 200
 #: Values that are remembered, until something is learned or happens.
 MEMORY = 32
 

@@ -128,7 +128,7 @@ class Runner:
             if not option:
                 continue
             lost = stuck is not None and bool(stuck[i])
-            arrived = not lost and self._arrived(option, state.aim[i], points[i])
+            arrived = not lost and math.dist(points[i].tolist(), state.aim[i].tolist()) <= self.graph.radius
             if arrived or lost or state.steps[i] >= state.timeout[i]:
                 runs.append(self._run(state, i, points[i], arrived, lost))
         if runs:
@@ -136,9 +136,6 @@ class Runner:
             for run in runs:
                 self._end(state, run)
         return state, runs
-
-    def _arrived(self, option: str, aim: np.ndarray, point: np.ndarray) -> bool:
-        return math.dist(point.tolist(), aim.tolist()) <= self.graph.radius
 
     def _run(self, state: RunnerState, i: int, point: np.ndarray, arrived: bool, lost: bool) -> Run:
         option = str(state.option[i])

@@ -5,14 +5,18 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.special import expit
 
-#: Runs, at least, from which the model is learned; before that every walk is as good as the next.
-MIN_RUNS = 30.0
+#: Runs that the first guess counts for, beside those that there were.
+GUESS_RUNS = 4.0
 #: Ridge on the coefficients of standardised features, in runs: few runs change little.
 RIDGE = 3.0
-#: Success of any walk before there are enough runs to learn from.
-FIRST_GUESS = 0.5
-#: Success below which a walk is of the doubtful kind: what its failures land in is learned apart.
-DOUBTFUL = 0.5
+#: Success of any walk before there are runs to learn from: of a policy that has hardly been trained.
+FIRST_GUESS = 0.25
+#: A crossing is hasty that was so many times faster than the fastest walks, which are this quantile of all that succeed.
+HASTY, FASTEST = 1.5, 0.1
+#: Success of hasty walks, and share of their failures that ends far away, before there are runs to learn from.
+HASTY_GUESS, HASTY_LOSS = 0.1, 0.5
+#: Least standard deviation of a feature: what never varies tells nothing.
+LEAST_SCALE = 0.1
 N_FEATURES = 7
 
 
@@ -30,35 +34,39 @@ class Kind(NamedTuple):
     forward: np.ndarray
     backward: np.ndarray
 
-    def features(self) -> np.ndarray:
+    @property
+    def seen(self) -> np.ndarray:
+        """Whether any trajectory went this way or the other."""
+        return (self.forward > 0) | (self.backward > 0)
+
+    def features(self, fastest: float) -> np.ndarray:
         """Return what the model goes by, shape ``(n, N_FEATURES)``.
 
         Walks whose way was seen forward, seen only backward and never seen at all are of three kinds, each with its own
-        level; what nobody walks (far in few steps) is told by the speed.
+        level.
+
+        :param fastest: environment steps that the fastest walks take for a radius
         """
-        seen = (self.forward > 0) | (self.backward > 0)
-        only_backward = (self.forward == 0) & seen
-        speed = np.where(seen, self.distance / np.maximum(self.steps, 1.0), 0.0)
-        unseen = ~seen
-        return np.stack(
-            [
-                np.log(self.distance + 0.1),
-                speed,
-                np.log1p(self.forward),
-                only_backward,
-                only_backward * speed,
-                unseen,
-                unseen * np.log(self.distance + 0.1),
-            ],
-            axis=1,
-        )
+        length = np.log(self.distance + 0.1)
+        backward = self.seen & (self.forward == 0)
+        haste = self.haste(fastest)
+        columns = [haste, length, np.log1p(self.forward), backward, backward * length, ~self.seen, ~self.seen * length]
+        return np.stack(columns, axis=1).astype(np.float64)
+
+    def haste(self, fastest: float) -> np.ndarray:
+        """Return by how much trajectories were faster than anybody walks (as a logarithm): luck, or no walk at all.
+
+        :param fastest: environment steps that the fastest walks take for a radius
+        """
+        ratio = fastest * self.distance / np.maximum(self.steps, 1.0)
+        return np.where(self.seen, np.log(np.maximum(ratio, 1.0)), 0.0)
 
 
 class WalkModel:
     """Predicts success and steps of untried walks: logistic and linear regression on all runs so far.
 
     It is fitted while learning only. ``loss``: which share of failures ends far away or nowhere rather than near where
-    the run began, for doubtful walks and for others.
+    the run began, for hasty walks and for others.
     """
 
     def __init__(self) -> None:
@@ -68,22 +76,23 @@ class WalkModel:
         self.intercept = float(np.log(FIRST_GUESS / (1.0 - FIRST_GUESS)))
         self.pace = np.array([2.0, 1.0, 0.8])  # steps: a constant, for each radius of distance, for each step of a crossing
         self.steps_per_radius = 5.0  # of walks where nobody has gone
-        self.loss = np.zeros(2)
+        self.fastest = 0.0  # steps that the fastest walks take for a radius
+        self.loss = np.array([HASTY_LOSS, 0.0])
         self.version = 0  # rises with every change
 
     def success(self, kind: Kind) -> np.ndarray:
         """Return the success rates to expect, shape ``(n,)``."""
-        return expit((kind.features() - self.mean) / self.scale @ self.coefficients + self.intercept)
+        standardised = (kind.features(self.fastest) - self.mean) / self.scale
+        return expit(standardised @ self.coefficients + self.intercept)
+
+    def is_hasty(self, kind: Kind) -> np.ndarray:
+        """Tell which walks would have to be faster than any, shape ``(n,)``."""
+        return kind.haste(self.fastest) > np.log(HASTY)
 
     def steps(self, kind: Kind) -> np.ndarray:
         """Return the environment steps that a successful run is expected to take, shape ``(n,)``, at least 1."""
-        seen = (kind.forward > 0) | (kind.backward > 0)
-        steps = np.where(seen, self._pace_features(kind) @ self.pace, self.steps_per_radius * kind.distance)
-        return np.maximum(steps, 1.0)
-
-    @staticmethod
-    def _pace_features(kind: Kind) -> np.ndarray:
-        return np.stack([np.ones_like(kind.distance), kind.distance, kind.steps], axis=1)
+        seen = _pace_features(kind) @ self.pace
+        return np.maximum(np.where(kind.seen, seen, self.steps_per_radius * kind.distance), 1.0)
 
     def fit(self, kind: Kind, successes: np.ndarray, failures: np.ndarray, success_steps: np.ndarray) -> None:
         """Learn from runs.
@@ -93,35 +102,41 @@ class WalkModel:
         :param failures: weight of those that failed
         :param success_steps: sum of the steps of the successful ones, weighted likewise
         """
+        if not (successes + failures > 0.0).any():
+            return
+        self._fit_pace(kind, successes, success_steps)
+        self._fit_success(kind, successes, failures)
+        self.version += 1
+
+    def _fit_success(self, kind: Kind, successes: np.ndarray, failures: np.ndarray) -> None:
         from sklearn.linear_model import LogisticRegression
 
-        runs = successes + failures
-        if runs.sum() < MIN_RUNS or successes.sum() < 1.0 or failures.sum() < 1.0:
-            return
-        tried = runs > 0.0
-        features, weight = kind.features()[tried], runs[tried]
+        features, weight = kind.features(self.fastest), successes + failures
         self.mean = np.average(features, axis=0, weights=weight)
-        self.scale = np.sqrt(np.average((features - self.mean) ** 2, axis=0, weights=weight)) + 1e-3
-        standardised = np.tile((features - self.mean) / self.scale, (2, 1))
-        outcomes = np.repeat([1, 0], len(features))
-        weights = np.concatenate([successes[tried], failures[tried]])
+        self.scale = np.sqrt(np.average((features - self.mean) ** 2, axis=0, weights=weight))
+        self.scale = np.maximum(self.scale, LEAST_SCALE)
+        # What is guessed first: the mean walk is one of a hardly trained policy, a hasty one hardly ever succeeds.
+        guessed = np.stack([self.mean, self.mean])
+        guessed[1, 0] = max(guessed[1, 0], np.log(2.0 * HASTY))
+        guesses = np.array([FIRST_GUESS, HASTY_GUESS])
+        standardised = (np.concatenate([features, guessed]) - self.mean) / self.scale
+        weights = np.concatenate([successes, GUESS_RUNS * guesses, failures, GUESS_RUNS * (1.0 - guesses)])
+        outcomes = np.repeat([1, 0], len(standardised))
         regression = LogisticRegression(C=1.0 / RIDGE, max_iter=200)
-        regression.fit(standardised[weights > 0], outcomes[weights > 0], sample_weight=weights[weights > 0])
+        regression.fit(np.tile(standardised, (2, 1))[weights > 0], outcomes[weights > 0], sample_weight=weights[weights > 0])
         self.coefficients, self.intercept = regression.coef_[0].copy(), float(regression.intercept_[0])
-        self._fit_pace(kind, successes, success_steps)
-        self.version += 1
 
     def _fit_pace(self, kind: Kind, successes: np.ndarray, success_steps: np.ndarray) -> None:
         reached = (successes > 0.0) & (kind.steps > 0.0)
         if not reached.any():
             return
-        self.steps_per_radius = float(success_steps[reached].sum() / (successes * kind.distance)[reached].sum())
-        features = self._pace_features(kind)[reached]
+        taken, distance = success_steps[reached] / successes[reached], kind.distance[reached]
+        self.steps_per_radius = float(success_steps[reached].sum() / (successes[reached] * distance).sum())
+        self.fastest = float(np.quantile(taken / distance, FASTEST))
         root = np.sqrt(successes[reached])
-        wanted = success_steps[reached] / successes[reached]
-        ridge = np.sqrt(RIDGE) * np.eye(features.shape[1])
-        left = np.concatenate([features * root[:, None], ridge])
-        right = np.concatenate([wanted * root, ridge @ self.pace])  # towards what was learned before
+        ridge = np.sqrt(RIDGE) * np.eye(len(self.pace))
+        left = np.concatenate([_pace_features(kind)[reached] * root[:, None], ridge])
+        right = np.concatenate([taken * root, ridge @ self.pace])  # towards what was learned before
         self.pace = np.linalg.lstsq(left, right, rcond=None)[0]
 
     def get_state(self) -> dict[str, Any]:
@@ -131,3 +146,7 @@ class WalkModel:
     def set_state(self, state: dict[str, Any]) -> None:
         """Restore what :meth:`get_state` returned."""
         vars(self).update(state)
+
+
+def _pace_features(kind: Kind) -> np.ndarray:
+    return np.stack([np.ones_like(kind.distance), kind.distance, kind.steps], axis=1)

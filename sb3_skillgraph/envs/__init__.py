@@ -27,6 +27,7 @@ __all__ = [
 # Entry points are names: MuJoCo is imported when an environment that needs it is made.
 _POINT = "sb3_skillgraph.envs.point_mazes:make_point_maze"
 _ANT = "sb3_skillgraph.envs.mujoco_mazes:AntMazeEnv"
+_OGBENCH = "sb3_skillgraph.envs.ogbench_mazes:OGBenchMazeEnv"
 _TOY = "sb3_skillgraph.envs.toy:ToyMazeEnv"
 _TASKS: dict[str, tuple[str, dict[str, Any]]] = {
     "SkillGraph/PointMazeUMaze-v0": (_POINT, {"maze_map": U_MAZE}),
@@ -39,6 +40,11 @@ _TASKS: dict[str, tuple[str, dict[str, Any]]] = {
     "SkillGraph/AntLarge-v0": (_ANT, {"maze_map": LARGE_MAZE}),
     "SkillGraph/AntMaze-v0": (_ANT, {}),
     "SkillGraph/ToyMaze-v0": (_TOY, {}),
+    **{
+        f"SkillGraph/OGBench{body.capitalize()}{maze.capitalize()}-v0": (_OGBENCH, {"name": f"{body}maze-{maze}-v0"})
+        for body in ("point", "ant")
+        for maze in ("medium", "large", "giant", "teleport")
+    },
 }
 
 

@@ -82,31 +82,26 @@ class MazeGeometry:
     """The plane geometry of a maze of square cells.
 
     Positions follow gymnasium-robotics: the origin is the centre of the map, row 0 is at the top (largest y).
+    ``extent`` is the rectangle of the map, walls included: (x min, x max, y min, y max).
 
     :param maze_map: rows of cells: ``1`` is a wall, ``0``, ``"r"`` (start), ``"g"`` and ``"c"`` are free; the border
         must be walls
     :param cell_size: side of a cell, in world units
+    :param center: where the centre of the map lies, (x, y)
     :raises ValueError: when the map or the cell size is unusable
     """
 
-    def __init__(self, maze_map: MazeMap, cell_size: float = 1.0) -> None:
+    def __init__(self, maze_map: MazeMap, cell_size: float = 1.0, center: tuple[float, float] = (0.0, 0.0)) -> None:
         if not (math.isfinite(cell_size) and cell_size > 0):
             raise ValueError(f"cell_size must be a positive number, not {cell_size!r}")
         self.maze_map = _validated(maze_map)
         self.cell_size = float(cell_size)
         self._is_wall = [[cell == _WALL for cell in row] for row in self.maze_map]
-        self._half_width = len(self.maze_map[0]) * self.cell_size / 2
-        self._half_height = len(self.maze_map) * self.cell_size / 2
+        half_width, half_height = len(self.maze_map[0]) * self.cell_size / 2, len(self.maze_map) * self.cell_size / 2
+        self.extent = center[0] - half_width, center[0] + half_width, center[1] - half_height, center[1] + half_height
+        self._left, self._top = self.extent[0], self.extent[3]
         self.free_cells = [(i, j) for i, row in enumerate(self._is_wall) for j, is_wall in enumerate(row) if not is_wall]
         self._corner_graphs: dict[float, _CornerGraph] = {}
-
-    @property
-    def extent(self) -> tuple[float, float, float, float]:
-        """The rectangle of the map, walls included.
-
-        :return: (x min, x max, y min, y max)
-        """
-        return -self._half_width, self._half_width, -self._half_height, self._half_height
 
     @property
     def start_cell(self) -> tuple[int, int]:
@@ -123,8 +118,8 @@ class MazeGeometry:
         :param column: column of the cell, 0 at the left
         :return: position, shape (2,)
         """
-        x = (column + 0.5) * self.cell_size - self._half_width
-        y = self._half_height - (row + 0.5) * self.cell_size
+        x = (column + 0.5) * self.cell_size + self._left
+        y = self._top - (row + 0.5) * self.cell_size
         return np.array([x, y])
 
     def walls(self) -> list[tuple[float, float, float, float]]:
@@ -134,7 +129,7 @@ class MazeGeometry:
         """
         size = self.cell_size
         return [
-            (j * size - self._half_width, self._half_height - (i + 1) * size, size, size)
+            (j * size + self._left, self._top - (i + 1) * size, size, size)
             for i, row in enumerate(self._is_wall)
             for j, is_wall in enumerate(row)
             if is_wall
@@ -165,7 +160,7 @@ class MazeGeometry:
 
     def _in_cells(self, x: float, y: float, margin: float) -> tuple[float, float, float]:
         size = self.cell_size
-        return (x + self._half_width) / size, (self._half_height - y) / size, margin / size
+        return (x - self._left) / size, (self._top - y) / size, margin / size
 
     def is_free(self, points: ArrayLike, margin: float = 0.0) -> NDArray[np.bool_]:
         """Which discs lie in free space.

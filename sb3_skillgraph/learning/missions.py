@@ -11,13 +11,19 @@ from sb3_skillgraph.learning.salience import Salience
 from sb3_skillgraph.runner import Run
 
 #: Failed runs after which a mission is given up.
-MAX_FAILURES = 6
+MAX_FAILURES = 3
+#: Share of the missions that explore; the others travel to any event. Fewer explorations make a worse walker.
+EXPLORE = 0.9
 #: Proposals of which an exploration takes the one whose nearest event has been visited least.
 N_PROPOSALS = 3
 #: Share of the explorations that go on towards the proposed point; the others walk at random.
 TOWARDS = 0.5
 #: Share of the missions that look for a way to a goal which adaptation is for, while nobody has been there.
 LOOK_FOR_A_WAY = 0.5
+
+
+#: Share of the missions without noise: noise makes its own luck, and only runs without it go into records.
+CLEAN = 0.5
 
 
 @dataclass
@@ -29,6 +35,7 @@ class Mission:
     :param beyond: the point to explore towards; None for a random walk
     :param exploring: whether exploration has begun
     :param n_failures: failed runs on the way
+    :param clean: whether the policy acts without noise, as it does in ``predict``, so that runs tell what it can do
     """
 
     goal: np.ndarray
@@ -36,6 +43,7 @@ class Mission:
     beyond: np.ndarray | None = None
     exploring: bool = False
     n_failures: int = 0
+    clean: bool = False
 
     @property
     def random_walk(self) -> bool:
@@ -48,7 +56,6 @@ class Missions:
 
     :param graph: the skill graph
     :param salience: proposes salient events
-    :param explore_prob: probability that a mission explores; the others travel to any event
     :param exploration_steps: environment steps of an exploration
     :param explore_beyond: event radii that an exploration towards a point goes on past it
     :param rng: random generator
@@ -58,14 +65,12 @@ class Missions:
         self,
         graph: SkillGraph,
         salience: Salience,
-        explore_prob: float,
         exploration_steps: int,
         explore_beyond: float,
         rng: np.random.Generator,
     ) -> None:
         self.graph = graph
         self.salience = salience
-        self.explore_prob = explore_prob
         self.exploration_steps = exploration_steps
         self.explore_beyond = explore_beyond
         self.rng = rng
@@ -86,6 +91,7 @@ class Missions:
         mission = self.current[env]
         if mission is None:
             mission = self._random_walk(point) if warm_up else self._choose(point)
+            mission.clean = not mission.random_walk and bool(self.rng.random() < CLEAN)
             self.current[env] = mission
         return mission
 
@@ -108,22 +114,30 @@ class Missions:
             self.current[env] = None
         return over or done or mission.exploring != was_exploring
 
+    def discovered(self, env: int) -> None:
+        """The agent has come where it has never been: an exploration goes on while it finds something."""
+        mission = self.current[env]
+        if mission is not None and mission.exploring:
+            mission.explore_steps = self.exploration_steps
+
     def _over(self, mission: Mission, point: np.ndarray) -> bool:
         """Whether a mission is over; an exploration begins on arrival, and ends after its steps."""
         if mission.exploring:
             mission.explore_steps -= 1
             return mission.explore_steps <= 0
-        if math.dist(point.tolist(), mission.goal.tolist()) > self.graph.radius:
-            return mission.n_failures >= MAX_FAILURES
-        mission.exploring = mission.explore_steps > 0
-        return not mission.exploring
+        arrived = math.dist(point.tolist(), mission.goal.tolist()) <= self.graph.radius
+        if not arrived and mission.n_failures >= MAX_FAILURES:
+            # Who cannot travel yet explores where it is: standing before a wall teaches nothing.
+            mission.beyond, mission.explore_steps, arrived = None, self.exploration_steps, True
+        mission.exploring = arrived and mission.explore_steps > 0
+        return arrived and not mission.exploring
 
     # -- choosing -----------------------------------------------------------------------------------------------------
 
     def _choose(self, point: np.ndarray) -> Mission:
         if self.pinned is not None:
             return self._adapt(self.pinned)
-        if self.rng.random() < self.explore_prob:
+        if self.rng.random() < EXPLORE:
             return self._explore(point)
         return Mission(self.graph.centers[self.rng.integers(len(self.graph.events))].copy())
 

@@ -127,9 +127,13 @@ class Rollout:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Add noise, or replace an action by a random one that is held for some steps."""
         added = self.rng.normal(0.0, NOISE, scaled.shape) if noise is None else noise()
-        scaled = scaled + added
+        noisy = scaled + added
         held, hold_left = self._held, self._hold_left.copy()
         for i, mission in enumerate(missions):
+            if mission.clean and not mission.random_walk:
+                hold_left[i] = 0
+                continue
+            scaled[i] = noisy[i]
             if hold_left[i] == 0 and (mission.random_walk or self.rng.random() < self.random_action_prob / HOLD):
                 held = held.copy()
                 held[i] = self.rng.uniform(-1.0, 1.0, held[i].shape)
@@ -172,12 +176,14 @@ class Rollout:
         by_env = {run.env: run for run in runs}
         over = np.zeros(len(points), dtype=bool)
         for i, point in enumerate(points):
-            if not stuck[i]:
-                self.witness.step(i, point)  # no event is to lie where agents get stuck
+            # No event is to lie where agents get stuck.
+            if not stuck[i] and self.witness.step(i, point):
+                self.missions.discovered(i)
             run, mission = by_env.get(i), self.missions.current[i]
             assert mission is not None
-            if run is not None and not mission.random_walk:
+            if run is not None and mission.clean and not mission.random_walk:
                 self.witness.ended(run)
+            if run is not None and not mission.random_walk:
                 if mission.exploring and run.success:
                     self._salient(point)
             over[i] = self.missions.observe(i, point, run, bool(dones[i]))

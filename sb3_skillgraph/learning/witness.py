@@ -8,7 +8,7 @@ from sb3_skillgraph.choices import ChoiceModel, Stance
 from sb3_skillgraph.graph import NOWHERE, SkillGraph
 from sb3_skillgraph.planning import DIRECT
 from sb3_skillgraph.runner import Run
-from sb3_skillgraph.walk_model import DOUBTFUL, Kind
+from sb3_skillgraph.walk_model import HASTY_LOSS, Kind
 
 #: Environment steps between two fits of the model of untried walks.
 FIT_EVERY = 1_000
@@ -73,33 +73,37 @@ class Witness:
         self._stays[env], self._step[env] = [], 0
         self._pass(env, point)
 
-    def step(self, env: int, point: np.ndarray) -> None:
+    def step(self, env: int, point: np.ndarray) -> bool:
         """A trajectory goes on.
 
         :param env: which environment
         :param point: where it has got to, shape ``(goal_dim,)``
+        :return: whether nobody has been there before
         """
         self._step[env] += 1
         self._n_steps += 1
-        self._pass(env, point)
+        is_new = self._pass(env, point)
         if self._n_steps >= FIT_EVERY:
             self._n_steps = 0
             self.fit()
+        return is_new
 
-    def _pass(self, env: int, point: np.ndarray) -> None:
+    def _pass(self, env: int, point: np.ndarray) -> bool:
         """Note in which event the trajectory is; a place that belongs to none becomes a landmark."""
         event = self.graph.locate(point)
-        if event == NOWHERE:
+        is_new = event == NOWHERE
+        if is_new:
             event = self.add_event(point, salient=False)
         stays, step = self._stays[env], self._step[env]
         distance = float(np.linalg.norm(self.graph.centers[event] - point))
         if stays and stays[-1].event == event:
             stays[-1].note(step, distance)
-            return
+            return is_new
         if stays:
             self._left(env)
         self.graph.visits[event] += 1
         self._stays[env].append(_Stay(event, step, distance))
+        return is_new
 
     def _left(self, env: int) -> None:
         """A stay is over: every event that was passed shortly before has been crossed from."""
@@ -179,16 +183,16 @@ class Witness:
         self._learn_loss(kinds)
 
     def _learn_loss(self, kinds: Kind) -> None:
-        """Learn which share of failures lands far away, for doubtful walks and for others."""
+        """Learn which share of failures lands far away, for hasty walks and for others."""
         graph, edges, model = self.graph, self.graph.edges, self.choice_model.model
         # With one entry more than there are events: NOWHERE is infinitely far away.
         centers = np.concatenate([graph.centers, np.full((1, graph.goal_dim), np.inf)])
         away = np.linalg.norm(centers[edges.landing] - graph.centers[edges.source][:, None], axis=2) / graph.radius
         far = away > FAR * (kinds.distance[:, None] + 1.0)
-        doubtful = model.success(kinds) < DOUBTFUL
+        hasty = model.is_hasty(kinds)
         weight = edges.landing_weight * graph.aging()[:, None]
-        for i, rows in enumerate((doubtful, ~doubtful)):
-            model.loss[i] = (weight * far)[rows].sum() / (weight[rows].sum() + FAR_PRIOR)
+        for i, (rows, guess) in enumerate(((hasty, HASTY_LOSS), (~hasty, 0.0))):
+            model.loss[i] = ((weight * far)[rows].sum() + FAR_PRIOR * guess) / (weight[rows].sum() + FAR_PRIOR)
 
     # -- saving -------------------------------------------------------------------------------------------------------
 
