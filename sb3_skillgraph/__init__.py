@@ -2,10 +2,17 @@
 
 from sb3_skillgraph import envs  # registers the environments
 from sb3_skillgraph.agent import SkillGraphAgent
+from sb3_skillgraph.evaluation import evaluate_pairs
+from sb3_skillgraph.options.env import OptionEnv
+from sb3_skillgraph.smdp import OptionsEnv, SMDPQLearning
 from sb3_skillgraph.version import __version__
 
 __all__ = [
+    "OptionEnv",
+    "OptionsEnv",
+    "SMDPQLearning",
     "SkillGraphAgent",
     "__version__",
     "envs",
+    "evaluate_pairs",
 ]

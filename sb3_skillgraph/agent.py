@@ -56,7 +56,7 @@ class SkillGraphAgent(OffPolicyAlgorithm):
     :param gamma: discount factor
     :param train_freq: environment steps between updates
     :param gradient_steps: minibatch updates per ``train_freq`` steps
-    :param action_noise: SB3 action noise; by default Gaussian noise of 0.1, in units of the scaled action
+    :param action_noise: SB3 action noise, or the standard deviation of Gaussian noise, in units of the scaled action
     :param stats_window_size: episodes over which SB3's rollout statistics are averaged
     :param tensorboard_log: folder of the TensorBoard log
     :param policy_kwargs: keyword arguments of the walker's policy; ``net_arch`` is ``[128, 128]`` unless given
@@ -101,7 +101,7 @@ class SkillGraphAgent(OffPolicyAlgorithm):
         gamma: float = 0.98,
         train_freq: int | tuple[int, str] = 2,
         gradient_steps: int = 1,
-        action_noise: ActionNoise | None = None,
+        action_noise: ActionNoise | float = 0.1,
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
         policy_kwargs: dict[str, Any] | None = None,
@@ -142,7 +142,7 @@ class SkillGraphAgent(OffPolicyAlgorithm):
             gamma=gamma,
             train_freq=train_freq,
             gradient_steps=gradient_steps,
-            action_noise=action_noise,
+            action_noise=action_noise if isinstance(action_noise, ActionNoise) else None,
             policy_kwargs=policy_kwargs,
             stats_window_size=stats_window_size,
             tensorboard_log=tensorboard_log,
@@ -271,10 +271,7 @@ class SkillGraphAgent(OffPolicyAlgorithm):
         assert isinstance(self._last_obs, dict)
         observation = {key: rows(self._last_obs, key) for key in ("observation", "achieved_goal")}
         scaled = self.parts.rollout.act(observation, self.num_timesteps < self.learning_starts, action_noise)
-        return self._unscale(scaled), scaled
-
-    def _unscale(self, scaled: np.ndarray) -> np.ndarray:
-        return self.parts.unscale(scaled).reshape((len(scaled), *self.action_space.shape))  # type: ignore[misc]
+        return self.parts.unscale(scaled), scaled
 
     def _store_transition(
         self,
@@ -390,7 +387,7 @@ class SkillGraphAgent(OffPolicyAlgorithm):
             running = running.begun_anew(np.asarray(episode_start, dtype=bool))
         running, runs = self.parts.runner.advance(running, batch["achieved_goal"])
         scaled, running = self.parts.runner.act(batch, batch["desired_goal"], running)
-        actions = self._unscale(scaled)
+        actions = self.parts.unscale(scaled)
         return (actions if vectorized else actions[0]), running, runs
 
     def _running_state(self, n_envs: int, state: tuple[np.ndarray, ...] | None) -> RunnerState:

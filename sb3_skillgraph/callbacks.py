@@ -11,9 +11,7 @@ REFRESH_STEPS = 500
 
 
 class SkillGraphProgressBarCallback(ProgressBarCallback):
-    """SB3's progress bar that also shows events, mature options, edges and coverage.
-
-    *Coverage* is the share of visited states from which some vertex of the graph can be entered.
+    """SB3's progress bar that also shows the graph: its events and edges, and how often walks succeed.
 
     :param until: total number of steps at which the bar is full, over several calls of ``learn``; None for the end of one
     """
@@ -42,9 +40,9 @@ class SkillGraphProgressBarCallback(ProgressBarCallback):
 
     def _describe(self) -> None:
         summary = self.model.graph_summary()
-        counts = "  ".join(f"{name} {summary[name]}" for name in ("events", "options", "edges"))
+        counts = "  ".join(f"{name} {summary[name]}" for name in ("events", "edges"))
         # The description is the only text that tqdm's rich bar shows; it has no postfix.
-        self.pbar.set_description(f"{counts}  coverage {summary['coverage']:.2f}", refresh=False)
+        self.pbar.set_description(f"{counts}  success {summary['success_rate']:.2f}", refresh=False)
 
     def _on_training_end(self) -> None:
         self._describe()

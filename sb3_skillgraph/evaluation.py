@@ -9,8 +9,8 @@ import numpy as np
 from scipy.stats import binomtest
 
 from sb3_skillgraph.agent import SkillGraphAgent
-from sb3_skillgraph.controller import GLOBAL, OptionOutcome
 from sb3_skillgraph.envs import MazeGeometry
+from sb3_skillgraph.planning import DIRECT
 
 
 class Predictor(Protocol):
@@ -39,7 +39,7 @@ class PairResult(NamedTuple):
     :param success: whether the goal was reached
     :param steps: environment steps until then, or until the end of the episode
     :param status: which of the paper's cases the goal was to the agent's graph; None for agents that do not plan
-    :param trace: how the agent's options did on the way; None for agents without a skill graph
+    :param trace: what the plan at the start promised, and how options did; None for agents without a skill graph
     :param nearest: least distance from the goal on the way, in world units
     :param stuck: whether the agent got stuck, as its environment tells in ``info["stuck"]``, which ends the episode
     """
@@ -56,17 +56,17 @@ class PairResult(NamedTuple):
 
 
 class CalibrationBin(NamedTuple):
-    """Plans of about the same predicted success.
+    """Plans of about the same promised success.
 
     :param low: where the bin begins
     :param n_plans: number of plans in it
-    :param predicted: their mean predicted success
-    :param observed: share of them that were followed to their end without a failure
+    :param promised: their mean success probability
+    :param observed: share of them whose goal was reached
     """
 
     low: float
     n_plans: int
-    predicted: float
+    promised: float
     observed: float
 
 
@@ -74,27 +74,18 @@ class CalibrationBin(NamedTuple):
 class SkillTrace:
     """How the options of a skill graph did on the way to one goal.
 
-    :param predicted: success probability of the plan at the start; None if it named no option to run
-    :param followed: whether the plan's last vertex, or the goal, was reached before any planned option failed
-    :param planned_steps: environment steps under options of the graph rather than the global option
-    :param n_runs: runs of such options that ended on the way
+    :param promised: success probability of the plan at the start
+    :param expected_steps: environment steps that it expected
+    :param n_runs: runs of options that ended on the way
     :param n_successes: how many of them reached their termination set
+    :param direct_steps: environment steps under the walk to the goal itself
     """
 
-    predicted: float | None
-    followed: bool | None = None
-    planned_steps: int = 0
+    promised: float
+    expected_steps: float
     n_runs: int = 0
     n_successes: int = 0
-
-    def count(self, outcomes: Sequence[OptionOutcome]) -> None:
-        """Count the planned options that have ended."""
-        for outcome in outcomes:
-            if outcome.option != GLOBAL:
-                self.n_runs += 1
-                self.n_successes += outcome.success
-                if self.followed is None and not outcome.success:
-                    self.followed = False
+    direct_steps: int = 0
 
 
 @dataclass(frozen=True)
@@ -120,34 +111,55 @@ class PairsResult:
 
     @property
     def traces(self) -> list[SkillTrace]:
-        """How the options did, pair by pair; empty for agents without a skill graph."""
+        """What plans promised and options did, pair by pair; empty for agents without a skill graph."""
         return [pair.trace for pair in self.pairs if pair.trace is not None]
 
     @property
-    def planned_share(self) -> float:
-        """Share of all environment steps that options of the graph took."""
-        return sum(trace.planned_steps for trace in self.traces) / max(sum(pair.steps for pair in self.pairs), 1)
-
-    @property
     def option_success_rate(self) -> float:
-        """Share of the runs of planned options that succeeded (NaN without any)."""
+        """Share of the runs of options that succeeded (NaN without any)."""
         n_runs = sum(trace.n_runs for trace in self.traces)
         return sum(trace.n_successes for trace in self.traces) / n_runs if n_runs else float("nan")
 
-    def calibration(self, n_bins: int = 5) -> list[CalibrationBin]:
-        """Compare what plans promised with what became of them.
+    @property
+    def promises(self) -> list[tuple[float, bool]]:
+        """What the plan of each pair promised, and whether the goal was reached; empty without a skill graph."""
+        return [(pair.trace.promised, pair.success) for pair in self.pairs if pair.trace is not None]
 
-        :param n_bins: number of equally wide bins of the predicted success
+    def calibration(self, n_bins: int = 5) -> list[CalibrationBin]:
+        """Compare what plans promised with what happened.
+
+        :param n_bins: number of equally wide bins of the promised success
         :return: the bins that hold plans, lowest first
         """
-        plans = [(t.predicted, bool(t.followed)) for t in self.traces if t.predicted is not None]
-        bins = []
-        for low in np.arange(n_bins) / n_bins:
-            inside = [plan for plan in plans if low <= plan[0] < low + 1 / n_bins or (plan[0] == 1.0 == low + 1 / n_bins)]
-            if inside:
-                predicted, followed = np.mean(inside, axis=0).tolist()
-                bins.append(CalibrationBin(float(low), len(inside), predicted, followed))
-        return bins
+        return calibration(self.promises, n_bins)
+
+
+def calibration(promises: Sequence[tuple[float, bool]], n_bins: int = 5) -> list[CalibrationBin]:
+    """Compare what plans promised with what happened.
+
+    :param promises: the promised success of each plan, and whether the goal was reached
+    :param n_bins: number of equally wide bins of the promised success
+    :return: the bins that hold plans, lowest first
+
+    >>> calibration([(0.9, True), (0.95, False)], n_bins=2)
+    [CalibrationBin(low=0.5, n_plans=2, promised=0.925, observed=0.5)]
+    """
+    bins = []
+    for i in range(n_bins):
+        inside = [plan for plan in promises if min(int(plan[0] * n_bins), n_bins - 1) == i]
+        if inside:
+            promised, observed = np.mean(inside, axis=0).tolist()
+            bins.append(CalibrationBin(i / n_bins, len(inside), promised, observed))
+    return bins
+
+
+def brier_score(promises: Sequence[tuple[float, bool]]) -> float:
+    """Return the mean squared difference between what was promised and what happened: 0 is best.
+
+    >>> brier_score([(1.0, True), (0.5, False)])
+    0.125
+    """
+    return float(np.mean([(promised - success) ** 2 for promised, success in promises]))
 
 
 def sample_pairs(
@@ -179,7 +191,7 @@ def sample_pairs(
 
 def evaluate_pairs(
     agent: Predictor,
-    env_id: str,
+    env: gym.Env | str,
     *,
     env_kwargs: dict[str, Any] | None = None,
     n_pairs: int = 100,
@@ -193,39 +205,41 @@ def evaluate_pairs(
     the episode (1000 steps on ``SkillGraph/*`` mazes).
 
     :param agent: anything with SB3's ``predict``
-    :param env_id: id of a ``SkillGraph/*`` environment
-    :param env_kwargs: keyword arguments for it, such as ``maze_map`` or ``success_radius``
+    :param env: a ``SkillGraph/*`` environment, or the id of one
+    :param env_kwargs: keyword arguments for an id, such as ``maze_map`` or ``success_radius``
     :param n_pairs: number of pairs
     :param seed: seed of the pairs, and of the environment
     :param adapt_timesteps: environment steps that a copy of the agent learns with each goal before it is tested
     :return: success rate, interval and every pair
     :raises NoPairsError: if the environment has no maze geometry to draw pairs from, or one that is too small
     """
-    if not env_id.startswith("SkillGraph/"):
-        raise NoPairsError(f"Pairs are drawn from the walls of a maze: that needs a SkillGraph/* environment, not {env_id!r}.")
-    env = gym.make(env_id, **{"terminate_on_success": True, **(env_kwargs or {})})
+    made = gym.make(env, **(env_kwargs or {})) if isinstance(env, str) else env
     try:
-        drawn = sample_pairs(env.get_wrapper_attr("geometry"), env.get_wrapper_attr("body_radius"), n_pairs, seed)
-        env.reset(seed=seed)
+        if not made.has_wrapper_attr("geometry"):
+            raise NoPairsError(f"Pairs are drawn from the walls of a maze: that needs a SkillGraph/* environment, not {env!r}.")
+        drawn = sample_pairs(made.get_wrapper_attr("geometry"), made.get_wrapper_attr("body_radius"), n_pairs, seed)
+        made.reset(seed=seed)
         results = []
         for start, goal, cells in drawn:
             tested: Any = agent
             if adapt_timesteps:
-                tested = tested.copy(gym.make(env_id, **(env_kwargs or {})))
+                assert made.spec is not None, "To adapt, give the environment's id."
+                tested = tested.copy(gym.make(made.spec))
                 tested.adapt(goal, start=start, total_timesteps=adapt_timesteps)
-            results.append(run_pair(tested, env, start, goal, cells))
+            results.append(run_pair(tested, made, start, goal, cells))
             if tested is not agent:
                 tested.get_env().close()
         return PairsResult(results)
     finally:
-        env.close()
+        if isinstance(env, str):
+            made.close()
 
 
 def run_pair(agent: Predictor, env: gym.Env, start: np.ndarray | None, goal: np.ndarray, cells: float) -> PairResult:
-    """Let an agent go from a start to a goal.
+    """Let an agent go from a start to a goal; the episode ends there.
 
     :param agent: anything with SB3's ``predict``
-    :param env: a ``SkillGraph/*`` environment that ends its episode on success
+    :param env: a ``SkillGraph/*`` environment
     :param start: shape ``(goal_dim,)``; None for where the environment puts the agent
     :param goal: shape ``(goal_dim,)``
     :param cells: length of the shortest free path, in cells
@@ -234,24 +248,21 @@ def run_pair(agent: Predictor, env: gym.Env, start: np.ndarray | None, goal: np.
     observation, info = env.reset(options={"start": start, "goal": goal})
     start = observation["achieved_goal"] if start is None else start
     watch = _Watch(agent, observation) if isinstance(agent, SkillGraphAgent) else None
+    act = agent.predict if watch is None else watch.predict
     state: tuple[np.ndarray, ...] | None = None
     episode_start = np.ones(1, dtype=bool)
     steps, nearest = 0, _distance(observation)
     stuck, over = False, bool(info["is_success"])
     while not over:
-        if watch is not None:
-            action, state = watch.act(observation, state)
-        else:
-            action, state = agent.predict(observation, state=state, episode_start=episode_start, deterministic=True)
+        action, state = act(observation, state=state, episode_start=episode_start, deterministic=True)
         episode_start = np.zeros(1, dtype=bool)
         observation, _, terminated, truncated, info = env.step(action)
         steps += 1
         nearest = min(nearest, _distance(observation))
         stuck = bool(info.get("stuck"))
-        over = terminated or truncated or stuck
-    success = bool(info["is_success"])
-    status, trace = (watch.plan.status, watch.ended(success, stuck)) if watch is not None else (None, None)
-    return PairResult(start, goal, cells, success, steps, status, trace, nearest, stuck)
+        over = bool(info["is_success"]) or terminated or truncated or stuck
+    status, trace = (watch.plan.status, watch.trace) if watch is not None else (None, None)
+    return PairResult(start, goal, cells, bool(info["is_success"]), steps, status, trace, nearest, stuck)
 
 
 def _distance(observation: Any) -> float:
@@ -264,22 +275,13 @@ class _Watch:
     def __init__(self, agent: SkillGraphAgent, observation: Any) -> None:
         self.agent = agent
         self.plan = agent.plan(observation)
-        runs_options = agent.planning and any(vertex in agent.graph.options for vertex in self.plan.path)
-        self.trace = SkillTrace(self.plan.success_probability if runs_options else None)
-        self.end = agent.graph.events[self.plan.path[-1]] if self.plan.path else None
-        self.planned = False  # whether an option of the graph is running
+        self.trace = SkillTrace(self.plan.success_probability, self.plan.expected_steps)
 
-    def act(self, observation: Any, state: tuple[np.ndarray, ...] | None) -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
-        action, new_state, outcomes = self.agent.act(observation, state)
-        self.trace.count(outcomes)
-        if self.end is not None and self.trace.followed is None and self.end.holds(np.asarray(observation["achieved_goal"])):
-            self.trace.followed = True
-        self.planned = bool(new_state.option[0] != GLOBAL)
-        self.trace.planned_steps += self.planned
-        return action, new_state
-
-    def ended(self, success: bool, stuck: bool) -> SkillTrace:
-        self.trace.n_runs += stuck and self.planned  # a run that getting stuck has ended
-        if self.trace.followed is None:
-            self.trace.followed = success
-        return self.trace
+    def predict(
+        self, observation: Any, state: tuple[np.ndarray, ...] | None = None, **kwargs: Any
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
+        action, new_state, runs = self.agent.act(observation, state)
+        self.trace.n_runs += len(runs)
+        self.trace.n_successes += sum(run.success for run in runs)
+        self.trace.direct_steps += new_state.option[0] == DIRECT
+        return action, tuple(new_state)

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 from stable_baselines3 import DDPG, SAC, TD3
+from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
@@ -95,14 +96,33 @@ class Parts:
             rng,
         )
         witness = Witness(graph, planner.choice_model, arguments["walk_steps"], agent.n_envs)
-        rollout = Rollout(runner, missions, witness, store, arguments["random_action_prob"], rng)
+        noise = arguments["action_noise"]
+        rollout = Rollout(
+            runner,
+            missions,
+            witness,
+            store,
+            0.0 if isinstance(noise, ActionNoise) else noise,
+            arguments["random_action_prob"],
+            rng,
+        )
         return cls(
             rng, view_name, factory, store, walker, graph, model, planner, runner, missions, witness, rollout
         )
 
     def unscale(self, scaled: np.ndarray) -> np.ndarray:
-        """Turn actions in [-1, 1], shape ``(n, action_dim)``, into the environment's own bounds."""
-        return self.factory.unscale(scaled)
+        """Turn actions in [-1, 1], shape ``(n, action_dim)``, into the environment's own, shape ``(n, *action_shape)``."""
+        return self.factory.unscale(scaled).reshape(len(scaled), *self.factory.action_space.shape)
+
+    def walk(self, observation: dict[str, np.ndarray], goals: np.ndarray) -> np.ndarray:
+        """Return what the walker does.
+
+        :param observation: ``observation`` and ``achieved_goal``, shapes ``(n, dim)``
+        :param goals: where it is to go, shape ``(n, goal_dim)``
+        :return: actions in the environment's own bounds, shape ``(n, *action_shape)``
+        """
+        seen = self.runner.view(observation["observation"], observation["achieved_goal"], goals)
+        return self.unscale(self.walker.actor.act(seen))
 
 
 def option_class(given: type[OffPolicyAlgorithm] | str) -> type[OffPolicyAlgorithm]:
@@ -126,6 +146,7 @@ _RANGES: dict[str, tuple[float, float]] = {
     "gradient_steps": (-1, np.inf),
     "max_events": (8, np.inf),
     "walk_steps": (1, np.inf),
+    "action_noise": (0, np.inf),
     "exploration_steps": (1, np.inf),
     "explore_beyond": (0, np.inf),
     "random_action_prob": (0, 1),
@@ -143,6 +164,8 @@ def check_numbers(arguments: dict[str, Any]) -> None:
     """
     for name, (low, high) in _RANGES.items():
         value = arguments[name]
+        if isinstance(value, ActionNoise):
+            continue
         if isinstance(value, bool) or not isinstance(value, int | float | np.number) or not low <= value <= high:
             raise ValueError(f"{name} must be a number from {low:g} to {high:g}, not {value!r}.")
 

@@ -44,7 +44,9 @@ def _arguments(agent: Any) -> dict[str, Any]:
     arguments = dict(agent._arguments)
     for name in ("batch_size", "buffer_size", "gamma", "gradient_steps", "learning_starts", "tau", "verbose"):
         arguments[name] = getattr(agent, name)
-    arguments.update(event_radius=agent.event_radius, action_noise=agent.action_noise)
+    arguments["event_radius"] = agent.event_radius
+    if agent.action_noise is not None:
+        arguments["action_noise"] = agent.action_noise
     if agent.parts.view_name is not None:
         arguments["option_view"] = agent.parts.view_name
     return arguments

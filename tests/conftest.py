@@ -28,18 +28,9 @@ th.set_num_threads(1)
 TOY, POINT = "SkillGraph/ToyMaze-v0", "SkillGraph/PointMazeUMaze-v0"
 #: Small networks and batches, an update at every step: a thousand steps take a second.
 SMALL: dict[str, Any] = dict(policy_kwargs=dict(net_arch=[16, 16]), batch_size=32, learning_starts=200, train_freq=1, seed=0)
-#: Options mature at their first success, one run of their own completes a chain, runs and explorations are short, and
-#: events are many and close together: a few hundred steps give a graph worth the name, with chains in both directions.
-EAGER: dict[str, Any] = dict(
-    SMALL,
-    seed=2,
-    gestation_period=1,
-    practice_runs=1,
-    option_timeout=50,
-    exploration_steps=20,
-    event_reach=10,
-    salient_event_freq=3,
-)
+#: Explorations are short and steps of learning long: two thousand steps give a graph whose walks have been run, with success
+#: and without.
+EAGER: dict[str, Any] = dict(SMALL, exploration_steps=20, learning_rate=3e-3)
 
 
 @pytest.fixture(autouse=True, scope="session")
@@ -180,7 +171,7 @@ def without_clock(state: dict[str, Any]) -> dict[str, Any]:
 
 def check_store(agent: SkillGraphAgent, transitions: list[dict[str, np.ndarray]], env: int = 0) -> None:
     """Every transition of one environment is in the store, once, and in order."""
-    store = agent.store
+    store = agent.parts.store
     rows = np.arange(store.oldest, store.total)[env :: agent.n_envs]
     assert len(rows) == len(transitions)
     if not transitions:
@@ -189,7 +180,7 @@ def check_store(agent: SkillGraphAgent, transitions: list[dict[str, np.ndarray]]
         expected = np.array([step[name] for step in transitions], dtype=np.float32)
         np.testing.assert_array_equal(store.column(name, rows), expected, err_msg=name)
     actions = np.array([step["action"] for step in transitions])
-    scaled = agent._factory.unscale(store.column("action", rows))
+    scaled = agent.parts.unscale(store.column("action", rows))
     np.testing.assert_allclose(scaled, actions, atol=1e-6)
 
 
@@ -203,10 +194,10 @@ def in_new_process(code: str, *arguments: object, hash_seed: int = 1) -> None:
 
 
 def rich(agent: SkillGraphAgent) -> bool:
-    """Whether an agent has mature options, edges, a place to which its graph leads there and back, and many more."""
-    complete = {(chain.source, chain.target) for chain in agent.chaining.chains.values() if chain.complete}
-    there_and_back = any((target, source) in complete for source, target in complete)
-    return len(agent.graph.options) > 4 and agent.graph.joined_pairs() > 0.5 and there_and_back
+    """Whether an agent's graph has events of both kinds, and edges of which runs are known, good and bad."""
+    edges, salient = agent.graph.edges, [event.salient for event in agent.events]
+    n_good, n_bad = np.count_nonzero(edges.successes), np.count_nonzero(edges.failures)
+    return len(salient) > 12 and 0 < sum(salient) < len(salient) and n_good >= 5 and n_bad >= 1
 
 
 # -- fixtures ---------------------------------------------------------------------------------------------------------
@@ -214,9 +205,9 @@ def rich(agent: SkillGraphAgent) -> bool:
 
 @pytest.fixture(scope="session")
 def trained_files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """An agent that has options and chains in both directions, and its replay buffer, as files."""
+    """An agent that finds its way in the maze, with a graph worth the name, and its replay buffer, as files."""
     folder = tmp_path_factory.mktemp("trained")
-    agent = new_agent().learn(1500, log_interval=None)
+    agent = new_agent().learn(2000, log_interval=None)
     while not rich(agent):
         assert agent.num_timesteps < 6000, agent.graph_summary()
         agent.learn(100, log_interval=None, reset_num_timesteps=False)

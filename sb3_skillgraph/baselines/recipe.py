@@ -10,6 +10,9 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.type_aliases import TrainFrequencyUnit
 
 from sb3_skillgraph.agent import SkillGraphAgent
+from sb3_skillgraph.baselines.straight_on import StraightOn
+from sb3_skillgraph.goal_env import as_batch
+from sb3_skillgraph.learning.missions import Mission
 from sb3_skillgraph.memory.replay import as_rows
 
 
@@ -54,12 +57,11 @@ class NewGoals(gym.Wrapper):
 
 class HindsightRecipe:
     """
-    The global option of a skill graph, learned by itself: TD3 or DDPG with hindsight.
+    The walker of a skill graph, learned by itself: TD3 or DDPG with hindsight.
 
-    It sees, is paid and learns from minibatches (no goal is put in shortly before a fall) as the options of a
-    :class:`~sb3_skillgraph.SkillGraphAgent` with the same arguments, under the same noise, is shaken loose where it stands
-    still, and all of that agent's updates go to it. Goals are the environment's (with :class:`NewGoals`, new ones as soon as
-    one is reached), and there are no events, no plans and no ways remembered.
+    It sees, is paid and learns from minibatches (no goal is put in shortly before a fall) as the walker of a
+    :class:`~sb3_skillgraph.SkillGraphAgent` with the same arguments, under the same noise. Goals are the environment's
+    (with :class:`NewGoals`, new ones as soon as one is reached), and there are no events and no plans.
 
     :param env: a goal environment; where its episodes end at the goal, with ``info["is_success"]``: without it an end at
         the goal counts as one for every other goal, too
@@ -71,9 +73,8 @@ class HindsightRecipe:
     def __init__(self, env: gym.Env, *, seed: int | None = None, **kwargs: Any) -> None:
         self.env = env
         self.agent = SkillGraphAgent(**{"policy": "MultiInputPolicy", **kwargs}, env=env, seed=seed)
-        self.agent.planning = False
+        self.policy = StraightOn(self.agent)
         self.agent.set_logger(Logger(folder=None, output_formats=[]))
-        self._state: tuple[np.ndarray, ...] | None = None
         if self.agent.train_freq.unit != TrainFrequencyUnit.STEP:  # type: ignore[union-attr]
             raise ValueError(f"train_freq must be a number of steps, not {self.agent.train_freq}.")
 
@@ -84,7 +85,7 @@ class HindsightRecipe:
         :param on_step: called after every environment step with their number
         :return: itself
         """
-        agent, store, policy = self.agent, self.agent.store, self.agent.global_option.learner.policy
+        agent, store = self.agent, self.agent.parts.store
         every: int = agent.train_freq.frequency  # type: ignore[union-attr]
         n_updates = agent.gradient_steps if agent.gradient_steps >= 0 else every
         store.cut()
@@ -92,7 +93,7 @@ class HindsightRecipe:
         begins = True
         for _ in range(total_timesteps):
             scaled = self._explore(observation, begins)
-            after, _, terminated, truncated, info = self.env.step(policy.unscale_action(scaled))
+            after, _, terminated, truncated, info = self.env.step(agent.parts.unscale(scaled[None])[0])
             stuck = bool(info.get("stuck"))
             over = terminated or truncated or stuck
             # An episode that ends at its own goal would have gone on for any other.
@@ -108,15 +109,15 @@ class HindsightRecipe:
 
     def _explore(self, observation: dict[str, np.ndarray], begins: bool) -> np.ndarray:
         """Return an action in [-1, 1], shape ``(action_dim,)``: a random one at first, then the policy's with noise."""
-        agent = self.agent
+        agent, rollout = self.agent, self.agent.parts.rollout
         if begins:  # the way to a goal
-            self._state, agent._hold_left[:] = None, 0
-        action, self._state = agent.predict(observation, self._state)
-        scaled = agent.global_option.learner.policy.scale_action(action)
-        warm_up = agent.store.total < agent.learning_starts
-        scaled = scaled.reshape(1, -1)
-        explored, agent._held_actions, agent._hold_left = agent._explore(scaled, [warm_up], agent.action_noise)
-        return explored.reshape(agent.action_space.shape)
+            rollout.hold_left[:] = 0
+        batch, _ = as_batch(observation, agent.observation_space)
+        scaled = agent.parts.walker.actor.act(agent.parts.runner.view(batch["observation"], batch["achieved_goal"], batch["desired_goal"]))
+        warm_up = agent.parts.store.total < agent.learning_starts
+        mission = Mission(batch["desired_goal"][0], exploring=warm_up)
+        explored, rollout.held, rollout.hold_left = rollout.with_noise(scaled, [mission], agent.action_noise)
+        return explored[0]
 
     def copy(self, env: gym.Env) -> "HindsightRecipe":
         """Return a copy that knows the same.
@@ -125,6 +126,6 @@ class HindsightRecipe:
         """
         twin = copy.copy(self)
         twin.env, twin.agent = env, self.agent.copy(env)
-        twin.agent.planning = False
+        twin.policy = StraightOn(twin.agent)
         twin.agent.set_logger(self.agent.logger)
         return twin

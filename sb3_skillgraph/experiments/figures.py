@@ -15,9 +15,9 @@ from sb3_skillgraph.envs import MazeGeometry
 from sb3_skillgraph.experiments.plan import RunSpec
 from sb3_skillgraph.experiments.runner import DONE, STRETCH, is_done
 from sb3_skillgraph.experiments.summary import estimate
+from sb3_skillgraph.learning.dco import learn_fiedler
 from sb3_skillgraph.plotting import paper_figures as draw
 from sb3_skillgraph.run_folder import STEPS, checkpoints, load_agent, read_progress
-from sb3_skillgraph.learning.dco import learn_fiedler
 
 SHARES = (0.1, 0.3, 0.6, 1.0)  # of the run, at which it is looked at
 N_PAIRS = 20_000
@@ -30,7 +30,7 @@ class MissingRunError(ValueError):
 def redraw(number: int, specs: Sequence[RunSpec], out: Path) -> Axes:
     """Redraw one of the paper's figures.
 
-    :param number: 3 to 9
+    :param number: 3, 4, 5, 6 or 9; 7 and 8 show edges between skills, which there are none of yet
     :param specs: the runs it is drawn from: all of them for 5, the first that fits for the others
     :param out: folder of all runs
     :return: axes of the figure
@@ -41,12 +41,10 @@ def redraw(number: int, specs: Sequence[RunSpec], out: Path) -> Axes:
         4: exploration,
         5: curves,
         6: growth,
-        7: edge_between_options,
-        8: edge_between_chains,
         9: failure_of_dco,
     }
     if number not in figures:
-        raise MissingRunError(f"There is no Figure {number} to redraw: it is one of 3 to 9.")
+        raise MissingRunError(f"There is no Figure {number} to redraw: it is one of {', '.join(map(str, figures))}.")
     return figures[number](specs, out)
 
 
@@ -88,8 +86,8 @@ def _geometry(spec: RunSpec) -> MazeGeometry:
 
 
 def _visits(agent: SkillGraphAgent) -> np.ndarray:
-    rows = np.arange(agent.store.oldest, agent.store.total)
-    return agent.store.column("next_achieved_goal", rows)
+    rows = np.arange(agent.parts.store.oldest, agent.parts.store.total)
+    return agent.parts.store.column("next_achieved_goal", rows)
 
 
 # -- figures ----------------------------------------------------------------------------------------------------------
@@ -100,11 +98,11 @@ def frontier(specs: Sequence[RunSpec], out: Path) -> Axes:
     spec = _finished(specs, out)[0]
     agent, geometry = _agent(spec, out), _geometry(spec)
     panels = draw.new_panels(len(SHARES))
-    visits, store = _visits(agent), agent.store
+    visits, store = _visits(agent), agent.parts.store
     for axes, share in zip(panels, SHARES, strict=True):
         n_steps = int(share * len(visits))
         store.total = store.oldest + n_steps  # what the agent knew then
-        embedding = learn_fiedler(store, agent._arguments["event_reach"], N_PAIRS, np.random.default_rng(0))
+        embedding = learn_fiedler(store, agent._arguments["walk_steps"], N_PAIRS, np.random.default_rng(0))
         points = draw.thinned(visits[:n_steps])
         values = embedding(points)
         ends = points[[values.argmin(), values.argmax()]]
@@ -215,56 +213,6 @@ def growth(specs: Sequence[RunSpec], out: Path) -> Axes:
     return panels[0]
 
 
-def edge_between_options(specs: Sequence[RunSpec], out: Path) -> Axes:
-    """Figure 7: two options at one event, the effects of one inside the initiation set of the other."""
-    return _edge(specs, out, to_event=True)
-
-
-def edge_between_chains(specs: Sequence[RunSpec], out: Path) -> Axes:
-    """Figure 8: the same along a chain, where an option leads to another option."""
-    return _edge(specs, out, to_event=False)
-
-
-def _edge(specs: Sequence[RunSpec], out: Path, to_event: bool) -> Axes:
-    for spec in _finished(specs, out):
-        example = clearest_edge(_agent(spec, out), to_event)
-        if example is not None:
-            panels = draw.new_panels(2)
-            draw.plot_edge(panels, example, _geometry(spec))
-            panels[0].figure.suptitle(_name(spec))
-            return panels[0]
-    raise MissingRunError(f"No graph in {out} has an edge of that kind between two options.")
-
-
-def clearest_edge(agent: SkillGraphAgent, to_event: bool) -> draw.EdgeExample | None:
-    """Find the edge between two options that is easiest to see: a sure one between sets that overlap little.
-
-    All effects of the first option lie where the second can start; the graph asks for the most of them only.
-
-    :param agent: the agent
-    :param to_event: whether the first option is to lead to an event rather than to another option
-    :return: None if there is no such edge
-    """
-    graph, points = agent.graph, draw.thinned(agent.visited.points)
-    best, example = -np.inf, None
-    for source, target, data in graph.nx.edges(data=True):
-        if source not in graph.options or target not in graph.options:
-            continue
-        first, second = graph.options[source], graph.options[target]
-        if (first.target in graph.events) != to_event or len(first.effects) < 3:
-            continue
-        if not second.initiation.optimistic(np.stack(first.effects)).all():
-            continue
-        starts, mine = (points[option.initiation.optimistic(points)] for option in (second, first))
-        overlap = float(second.initiation.optimistic(mine).mean()) if len(mine) else 1.0
-        if data["success_rate"] - overlap > best:
-            best = data["success_rate"] - overlap
-            center = graph.events[first.target].center if first.target in graph.events else None
-            names = (source, str(first.target), target)
-            example = draw.EdgeExample(names, np.stack(first.effects), starts, mine, center, data["success_rate"])
-    return example
-
-
 def failure_of_dco(specs: Sequence[RunSpec], out: Path) -> Axes:
     """Figure 9: where deep covering options find no events, beside the agent with another salience."""
     panels = draw.new_panels(2)
@@ -277,5 +225,5 @@ def failure_of_dco(specs: Sequence[RunSpec], out: Path) -> Axes:
         missed = np.array([pair["goal"] for pair in pairs if not pair["success"]]).reshape(-1, agent.graph.goal_dim)
         centers = np.array([event.center for event in agent.events])
         title = f"{_name(spec)}:\n{len(centers)} events, {len(missed)} of {len(pairs)} goals missed"
-        draw.plot_missed(axes, agent.visited.points, centers, missed, _geometry(spec), title)
+        draw.plot_missed(axes, _visits(agent), centers, missed, _geometry(spec), title)
     return panels[0]

@@ -15,7 +15,16 @@ from stable_baselines3 import DDPG, TD3
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_skillgraph.agent import SkillGraphAgent
-from sb3_skillgraph.baselines import CoveringOptions, HindsightRecipe, NewGoals, OptionTask, RandomWalk, make_her, make_uvfa
+from sb3_skillgraph.baselines import (
+    CoveringOptions,
+    HindsightRecipe,
+    NewGoals,
+    OptionTask,
+    RandomWalk,
+    StraightOn,
+    make_her,
+    make_uvfa,
+)
 from sb3_skillgraph.evaluation import Predictor
 from sb3_skillgraph.hyperparams import check_hyperparams, did_you_mean, load_hyperparams
 from sb3_skillgraph.options.learner import OptionDDPG, OptionTD3
@@ -172,40 +181,27 @@ class SkillGraphLearner(Learner):
 
     def snapshot(self) -> dict[str, Any]:
         """Return events and what joins them."""
-        graph = self.agent.graph
-        numbers = {id: i for i, id in enumerate(graph.events)}
-        links = near_links(event_links(graph))
+        numbers = {event.id: i for i, event in enumerate(self.agent.events)}
+        links = near_links(event_links(self.agent))
         return {
-            "centers": [event.center.tolist() for event in graph.events.values()],
+            "centers": [event.center.tolist() for event in self.agent.events],
             "links": [[numbers[link.source], numbers[link.target]] for link in links],
         }
 
 
-class PlanningOffLearner(SkillGraphLearner):
-    """The same, tested with planning off: its global option walks straight to every goal."""
+class StraightOnLearner(SkillGraphLearner):
+    """The same, tested without its graph: its walker goes straight to every goal."""
 
     @property
     def policy(self) -> Predictor:  # type: ignore[override]
         """What is tested."""
-        return _PlanningOff(self.agent)
+        return StraightOn(self.agent)
 
     def practise(self, env: gym.Env, start: np.ndarray, goal: np.ndarray, stretches: list[int]) -> Iterator[Predictor]:
         """Adapt a copy."""
         for twin in super().practise(env, start, goal, stretches):
             assert isinstance(twin, SkillGraphAgent)
-            yield _PlanningOff(twin)
-
-
-class _PlanningOff:
-    def __init__(self, agent: SkillGraphAgent) -> None:
-        self.agent = agent
-
-    def predict(self, *args: Any, **kwargs: Any) -> Any:
-        self.agent.planning = False
-        try:
-            return self.agent.predict(*args, **kwargs)
-        finally:
-            self.agent.planning = True  # for what it learns from later
+            yield StraightOn(twin)
 
 
 def _checking(every: int, end: int, check: Check) -> Check:
@@ -286,12 +282,12 @@ class HERLearner(GoalConditionedLearner):
 
 
 class RecipeLearner(Learner):
-    """The skill graph's global option, learned by itself."""
+    """The skill graph's walker, learned by itself."""
 
     def __init__(self, env_id: str, env_kwargs: dict[str, Any], seed: int, arguments: dict[str, Any]) -> None:
         env = NewGoals(gym.make(env_id, **env_kwargs), GOAL_STEPS)
         self.recipe = HindsightRecipe(env, seed=seed, **self.resolve(env_id, arguments))
-        self.policy: SkillGraphAgent = self.recipe.agent
+        self.policy = self.recipe.policy
 
     @classmethod
     def check_arguments(cls, arguments: dict[str, Any], where: str) -> None:
@@ -310,15 +306,15 @@ class RecipeLearner(Learner):
 
     def save(self, folder: Path) -> None:
         """Save the agent."""
-        self.policy.save(folder / AGENT)
+        self.recipe.agent.save(folder / AGENT)
 
     def practise(self, env: gym.Env, start: np.ndarray, goal: np.ndarray, stretches: list[int]) -> Iterator[Predictor]:
         """Let a copy go on learning."""
         twin = self.recipe.copy(env)
-        yield twin.agent
+        yield twin.policy
         for n_steps in stretches:
             twin.learn(n_steps)
-            yield twin.agent
+            yield twin.policy
 
 
 class CoveringOptionsLearner(Learner):
@@ -402,7 +398,7 @@ class RandomWalkLearner(Learner):
 
 ALGORITHMS: dict[str, type[Learner]] = {
     "skill_graph": SkillGraphLearner,
-    "planning_off": PlanningOffLearner,
+    "straight_on": StraightOnLearner,
     "uvfa": UVFALearner,
     "her": HERLearner,
     "recipe": RecipeLearner,

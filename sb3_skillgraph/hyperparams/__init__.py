@@ -7,14 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import yaml
-from stable_baselines3 import DDPG, SAC, TD3
 
 from sb3_skillgraph.agent import SkillGraphAgent
-from sb3_skillgraph.options.learner import OptionDDPG, OptionTD3
+from sb3_skillgraph.parts import OPTION_CLASSES
 
 FILE = Path(__file__).parent / "skillgraph.yml"
 
-_OPTION_CLASSES: dict[str, Any] = {cls.__name__: cls for cls in (OptionDDPG, OptionTD3, DDPG, TD3, SAC)}
 # `n_timesteps` is for learn(); the others of these are given by who makes the agent.
 _PARAMETERS = inspect.signature(SkillGraphAgent.__init__).parameters
 _KNOWN = ({"n_timesteps"} | set(_PARAMETERS)) - {"self", "env", "seed", "_init_setup_model"}
@@ -61,9 +59,9 @@ def check_hyperparams(values: dict[str, Any], origin: str) -> dict[str, Any]:
     checked = {name: _number(name, value, origin) for name, value in values.items()}
     if "option_class" in checked:
         name = checked["option_class"]
-        if name not in _OPTION_CLASSES:
-            raise ValueError(f"{origin}: unknown option_class {name!r}; it is one of {', '.join(_OPTION_CLASSES)}.")
-        checked["option_class"] = _OPTION_CLASSES[name]
+        if name not in OPTION_CLASSES:
+            raise ValueError(f"{origin}: unknown option_class {name!r}; it is one of {', '.join(OPTION_CLASSES)}.")
+        checked["option_class"] = OPTION_CLASSES[name]
     return checked
 
 

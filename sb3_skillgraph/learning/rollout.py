@@ -12,8 +12,6 @@ from sb3_skillgraph.memory.replay import TransitionStore
 from sb3_skillgraph.planning import DIRECT
 from sb3_skillgraph.runner import Runner, RunnerState
 
-#: Standard deviation of the Gaussian noise on scaled actions, where no ``action_noise`` is given.
-NOISE = 0.1
 #: A random action is held for so many environment steps in the mean: single ones average out.
 HOLD = 10
 
@@ -37,6 +35,7 @@ class Rollout:
     :param missions: what the agent is about
     :param witness: learns from trajectories and runs
     :param store: receives every transition, once
+    :param noise_std: standard deviation of the Gaussian noise on scaled actions, where no other noise is given
     :param random_action_prob: share of the steps, beside explorations, that are random
     :param rng: random generator
     """
@@ -47,6 +46,7 @@ class Rollout:
         missions: Missions,
         witness: Witness,
         store: TransitionStore,
+        noise_std: float,
         random_action_prob: float,
         rng: np.random.Generator,
     ) -> None:
@@ -54,6 +54,7 @@ class Rollout:
         self.missions = missions
         self.witness = witness
         self.store = store
+        self.noise_std = noise_std
         self.random_action_prob = random_action_prob
         self.rng = rng
         self.pending: Step | None = None
@@ -73,8 +74,8 @@ class Rollout:
         """Forget what the environments were in the middle of."""
         n_envs, graph = self.store.n_envs, self.runner.graph
         self.state = RunnerState.fresh(n_envs, graph.goal_dim)
-        self._held = np.zeros((n_envs, self.store.action_dim), dtype=np.float32)
-        self._hold_left = np.zeros(n_envs, dtype=np.int64)
+        self.held = np.zeros((n_envs, self.store.action_dim), dtype=np.float32)
+        self.hold_left = np.zeros(n_envs, dtype=np.int64)
         self.pending = None
         self.store.cut()
         self.witness.cut(n_envs)
@@ -104,7 +105,7 @@ class Rollout:
         state = self._explorers(self.state, missions)
         goals = np.stack([mission.goal for mission in missions])
         scaled, state = self.runner.act(observation, goals, state, Stance.OPTIMISTIC)
-        scaled, held, hold_left = self._with_noise(scaled, missions, noise)
+        scaled, held, hold_left = self.with_noise(scaled, missions, noise)
         self.pending = Step(observation, scaled, state.aim, state, held, hold_left, rng_state)
         return scaled
 
@@ -122,13 +123,19 @@ class Rollout:
             state.steps[i], state.timeout[i] = 0, mission.explore_steps
         return state
 
-    def _with_noise(
+    def with_noise(
         self, scaled: np.ndarray, missions: list[Mission], noise: ActionNoise | None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Add noise, or replace an action by a random one that is held for some steps."""
-        added = self.rng.normal(0.0, NOISE, scaled.shape) if noise is None else noise()
+        """Add noise, or replace an action by a random one that is held for some steps.
+
+        :param scaled: actions in [-1, 1], shape ``(n_envs, action_dim)``; noise is added in place
+        :param missions: what each agent is about
+        :param noise: to add; None for Gaussian noise
+        :return: the actions, the random ones that are held, and for how many more steps
+        """
+        added = self.rng.normal(0.0, self.noise_std, scaled.shape) if noise is None else noise()
         noisy = scaled + added
-        held, hold_left = self._held, self._hold_left.copy()
+        held, hold_left = self.held, self.hold_left.copy()
         for i, mission in enumerate(missions):
             if mission.clean and not mission.random_walk:
                 hold_left[i] = 0
@@ -169,7 +176,7 @@ class Rollout:
             dones,
             stuck,
         )
-        self._held, self._hold_left, self.pending = step.held, step.hold_left, None
+        self.held, self.hold_left, self.pending = step.held, step.hold_left, None
         for i in np.flatnonzero(step.state.steps == 1).tolist():
             self.witness.began(i, step.observation["achieved_goal"][i])
         self.state, runs = self.runner.advance(step.state, points, stuck)
@@ -188,7 +195,7 @@ class Rollout:
                     self._salient(point)
             over[i] = self.missions.observe(i, point, run, bool(dones[i]))
             self.n_stuck += bool(stuck[i])
-        self._hold_left = np.where(dones, 0, self._hold_left)
+        self.hold_left = np.where(dones, 0, self.hold_left)
         if over.any():
             self.state = self.state.begun_anew(over)
 
@@ -202,7 +209,7 @@ class Rollout:
 
     def get_state(self) -> dict[str, Any]:
         """Return what the environments are in the middle of, as plain data."""
-        state = {"runner": tuple(self.state), "held": self._held, "hold_left": self._hold_left, "n_stuck": self.n_stuck}
+        state = {"runner": tuple(self.state), "held": self.held, "hold_left": self.hold_left, "n_stuck": self.n_stuck}
         return {**state, "missions": self.missions.get_state(), "witness": self.witness.get_state()}
 
     def set_state(self, state: dict[str, Any], same_envs: bool) -> None:
@@ -217,5 +224,5 @@ class Rollout:
             self._forget()
             return
         self.state = RunnerState(*state["runner"])
-        self._held, self._hold_left = state["held"], state["hold_left"]
+        self.held, self.hold_left = state["held"], state["hold_left"]
         self.missions.set_state(state["missions"])

@@ -39,25 +39,6 @@ class GraphSnapshot(NamedTuple):
     links: list[tuple[int, int]]
 
 
-class EdgeExample(NamedTuple):
-    """Two options and the edge between them: the effects of the first lie where the second can start.
-
-    :param names: of the first option, the event or option it leads to, and the second option
-    :param effects: where the first has ended, shape ``(n, goal_dim)``
-    :param starts: visited states in the initiation set of the second, shape ``(m, goal_dim)``
-    :param first_starts: visited states in the initiation set of the first, shape ``(k, goal_dim)``
-    :param target: centre of the event the first leads to; None if it leads to an option
-    :param success_rate: of the edge
-    """
-
-    names: tuple[str, str, str]
-    effects: np.ndarray
-    starts: np.ndarray
-    first_starts: np.ndarray
-    target: np.ndarray | None
-    success_rate: float
-
-
 def new_panels(n_panels: int, n_rows: int = 1) -> list[Axes]:
     """Make a figure of panels side by side.
 
@@ -170,43 +151,6 @@ def plot_growth(axes: Axes, snapshot: GraphSnapshot, geometry: MazeGeometry | No
     axes.plot(*centers.T, "o", color=figures.EVENT, markersize=5, zorder=figures.Z_EVENT)
     n_joined = len({frozenset(link) for link in snapshot.links})
     axes.set_title(f"{name}, {snapshot.steps:,} steps:\n{len(centers)} events, {n_joined} joined pairs")
-
-
-def plot_edge(axes: Sequence[Axes], example: EdgeExample, geometry: MazeGeometry | None) -> None:
-    """Draw the sets behind an edge, and the edge (Figures 7 and 8).
-
-    :param axes: one panel for the maze, one for the graph
-    :param example: the edge
-    :param geometry: the maze
-    """
-    first, target, second = example.names
-    floor, graph = axes
-    everything = np.concatenate([example.starts, example.first_starts, example.effects])
-    figures.draw_floor(floor, geometry, everything, 1.0)
-    for points, colour in ((example.first_starts, "#c7c7c7"), (example.starts, "#74c476")):
-        floor.plot(*figures.project(points).T, "s", color=colour, markersize=3, alpha=0.7, zorder=figures.Z_REGION)
-    floor.plot(*figures.project(example.effects).T, "x", color="#d7301f", markersize=5, zorder=figures.Z_EFFECT)
-    if example.target is not None:
-        floor.plot(*figures.project(example.target[None]).T, "o", color="#2171b5", markersize=9, zorder=figures.Z_EVENT)
-    floor.legend(
-        handles=[
-            Patch(color="#c7c7c7", label=f"initiation set of {first}"),
-            Patch(color="#d7301f", label=f"effect set of {first}, which leads to {target}"),
-            Patch(color="#74c476", label=f"initiation set of {second}"),
-        ],
-        loc="upper center",
-        bbox_to_anchor=(0.5, -0.12),
-        fontsize=8,
-        frameon=False,
-    )
-    floor.set_title(f"The effects of {first} lie where {second} can start ...")
-    graph.set_axis_off()
-    graph.set(xlim=(0, 1), ylim=(0, 1))
-    graph.annotate("", (0.7, 0.5), (0.3, 0.5), arrowprops={"arrowstyle": "-|>", "linewidth": 2, "shrinkA": 22, "shrinkB": 22})
-    for x, name in ((0.25, first), (0.75, second)):
-        graph.text(x, 0.5, name, ha="center", va="center", bbox={"boxstyle": "circle,pad=0.6", "facecolor": "white"})
-    graph.text(0.5, 0.56, f"success rate {example.success_rate:.2f}", ha="center", fontsize=9)
-    graph.set_title("... which makes an edge")
 
 
 def plot_missed(
