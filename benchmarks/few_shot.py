@@ -77,7 +77,7 @@ def run_seed(args: argparse.Namespace, seed: int) -> dict[str, Any]:
     th.set_num_threads(1)
     agent = SkillGraphAgent("MultiInputPolicy", gym.make(ENV, maze_map=SHUT), seed=seed)
     agent.learn(args.steps, log_interval=None)
-    env = gym.make(ENV, maze_map=OPENED, terminate_on_success=True)
+    env = gym.make(ENV, maze_map=OPENED)
     env.reset(seed=seed)
     halves = Halves(env, seed + 1000)
     old = [halves.pair() for _ in range(args.old_pairs)]

@@ -1,229 +1,125 @@
-"""
-What grows with the graph, and how fast: synthetic graphs of 10 to 10 000 options in the plane.
+"""What a step costs as an agent grows: with what it has visited, and with the events of its graph.
 
-Options start from sets of 50 support points, of which about five cover any point, and end in one of the events near by;
-edges follow from the sets, through the code that makes them while learning. Only the networks are shared, as nothing here
-asks what they have learned. Timed, as medians: one ``predict`` while an option runs; choosing an option on the way to a
-goal, and ``plan``, each right after an outcome has changed the graph; recording an outcome (the refit of its set included)
-and updating the edges. Exponents are the slopes of straight lines through the logarithms.
+    OMP_NUM_THREADS=1 python -m benchmarks.scaling --out benchmarks/results/scaling.json
 
-Run it with ``OMP_NUM_THREADS=1 python -m benchmarks.scaling --out benchmarks/results/scaling.json``.
+*Visited*: an agent on the toy environment whose store holds so many transitions; a learning step (mean over whole runs of
+``learn``, growth and updates included), a ``predict`` while an option runs, and a decision (a plan for a new goal).
+*Events*: a graph laid by hand over an open square, each event joined to the events around it; a decision, and ``plan``, which
+works out what it promises as well. Medians over turns; the machine's own noise is in them.
 """
 
 import argparse
-import gc
 import json
-import resource
 import statistics
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import torch as th
-from stable_baselines3.td3.policies import TD3Policy
 
 from sb3_skillgraph import SkillGraphAgent
-from sb3_skillgraph.chaining import SkillChain
-from sb3_skillgraph.controller import ControllerState, Request
-from sb3_skillgraph.events import Event
-from sb3_skillgraph.options.initiation import Boundary
-from sb3_skillgraph.options.option import Option
+from sb3_skillgraph.choices import Start
+from sb3_skillgraph.graph import MAX_DEGREE, SPACING, SkillGraph
+from sb3_skillgraph.planning import Planner
+from sb3_skillgraph.walk_model import WalkModel
 
-RADIUS, SUPPORT, DEGREE, EVENTS_PER_OPTION = 0.45, 50, 5, 0.2
-REACH = 3 * RADIUS  # an option leads to an event that is not further away
-N_VISITED = 20_000
-TIMES = ("predict_us", "choose_ms", "plan_ms", "record_ms")
-BARS = {"choose_ms": {1_000: 5.0, 10_000: 50.0}, "plan_ms": {1_000: 5.0, 10_000: 50.0}}
+TOY = "SkillGraph/ToyMaze-v0"
+VISITED, EVENTS = (0, 50_000, 200_000), (50, 500, 5_000)
+TRAINED, STRETCH = 3_000, 1_000  # environment steps before, and in one turn of, the measurement of learning
+TURNS = 7
 
 
-class Plane:
-    """
-    An agent whose graph is filled with synthetic options.
-
-    :param n_options: number of options
-    :param seed: seed of where they are
-    """
-
-    def __init__(self, n_options: int, seed: int = 0) -> None:
-        self.rng = np.random.default_rng(seed)
-        env = gym.make("SkillGraph/PointMazeUMaze-v0")
-        self.agent = SkillGraphAgent("MultiInputPolicy", env, seed=seed, buffer_size=100, device="cpu")
-        # As many options as are to cover a point start within a set's radius of it.
-        self.side = float(np.sqrt(n_options * np.pi * REACH**2 / DEGREE))
-        for _ in range(max(int(n_options * EVENTS_PER_OPTION), 2)):
-            self.agent.discovery.add(self.rng.uniform(0.0, self.side, 2))
-        self.centers = np.stack([event.center for event in self.agent.events])
-        for _ in range(n_options):
-            self.add_option()
-        self.wander()
-
-    def add_option(self) -> None:
-        """Add a mature option that leads from somewhere to one of the events near by, or to the nearest."""
-        start = self.rng.uniform(0.0, self.side, 2)
-        distances = np.linalg.norm(self.centers - start, axis=1)
-        near = np.flatnonzero(distances < 2 * REACH)
-        event = self.agent.events[int(self.rng.choice(near) if len(near) else distances.argmin())]
-        chaining = self.agent.chaining
-        option = Option(f"o{len(chaining.options) + 1}", event.id, event, self.agent.global_option.learner, RADIUS)
-        self.lay_set(option, start)
-        option.effects.extend(event.center + self.rng.normal(0.0, 0.1 * RADIUS, (10, 2)))
-        option.record.extend(self.rng.random(20) < 0.9)
-        option.n_runs, option.n_successes, option.mature = 20, sum(option.record), True
-        chaining.options[option.id] = option
-        chain = SkillChain(f"{event.id}>{option.id}", event.id, event.id, [option.id], complete=True)
-        chaining.chains[chain.id] = chaining.chain_of[option.id] = chain
-        self.agent.graph.add_option(option)
-
-    def lay_set(self, option: Option, start: np.ndarray) -> None:
-        """Put 50 support points around a start, and the boundary where they thin out."""
-        angle, distance = self.rng.uniform(0, 2 * np.pi, SUPPORT), REACH * np.sqrt(self.rng.random(SUPPORT))
-        points = start + np.stack([distance * np.cos(angle), distance * np.sin(angle)], axis=1)
-        boundary = Boundary(points, np.full(SUPPORT, 1.0 / SUPPORT), -0.15, 4.0 / REACH**2)
-        option.initiation.add_success(points)
-        option.initiation.optimistic_boundaries = option.initiation.pessimistic_boundaries = [boundary]
-        option.initiation.core = start
-
-    def wander(self) -> None:
-        """Fill the memory of visited states with straight walks from event to event."""
-        visited, step = self.agent.visited, 0
-        visited.set_events(self.centers, np.full(len(self.centers), RADIUS))
-        while visited.size < N_VISITED:
-            here = self.centers[self.rng.integers(len(self.centers))]
-            there = here + self.rng.normal(0.0, 2 * REACH, 2)
-            for share in np.linspace(0.0, 1.0, 40):
-                step += 1
-                visited.record(0, step, (here + share * (there - here)).astype(np.float32), share == 1.0)
-
-    def point(self) -> np.ndarray:
-        """Return a random point."""
-        return self.rng.uniform(0.0, self.side, 2)
-
-    def record(self) -> None:
-        """Record a success, or now and then a failure, of a random option."""
-        chaining, options = self.agent.chaining, list(self.agent.graph.options.values())
-        option = options[self.rng.integers(len(options))]
-        core = option.initiation.core
-        assert core is not None and isinstance(option.termination, Event)
-        start, end = core + self.rng.normal(0.0, 0.3 * RADIUS, 2), option.termination.center
-        if self.rng.random() < 0.9:
-            chaining.learn_success(option, np.linspace(start, end, 30), end)
-        else:
-            chaining.learn_failure(option, start)
-
-    def predict_seconds(self, repeats: int) -> float:
-        """
-        :param repeats: number of calls
-        :return: seconds of one ``predict`` while an option runs
-        """
-        agent = self.agent
-        option = next(
-            o for o in agent.graph.options.values() if o.initiation.core is not None and not o.terminates(o.initiation.core)
-        )
-        state = tuple(ControllerState.fresh(1)._replace(option=np.array([agent.controller.index(option)])))
-        core = option.initiation.core
-        assert core is not None
-        observation = {"observation": np.zeros(4, dtype=np.float32), "achieved_goal": core, "desired_goal": self.point()}
-        start = time.perf_counter()
-        for _ in range(repeats):
-            agent.predict(observation, state)
-        return (time.perf_counter() - start) / repeats
-
-    def measure(self, repeats: int) -> dict[str, float]:
-        """
-        :param repeats: number of timings of each
-        :return: median milliseconds by name
-        """
-        agent = self.agent
-        questions: dict[str, Callable[[], object]] = {
-            "choose_ms": lambda: agent.controller.choose(self.point(), Request(self.point()), 0, ()),
-            "plan_ms": lambda: agent.planner.plan(self.point(), self.point(), RADIUS),
-            "record_ms": self.record,
-        }
-        seconds: dict[str, list[float]] = {name: [] for name in questions}
-        for _ in range(repeats):
-            for name, function in questions.items():
-                self.record()  # so that nothing is remembered from the time before
-                start = time.perf_counter()
-                function()
-                seconds[name].append(time.perf_counter() - start)
-        return {name: 1e3 * statistics.median(times) for name, times in seconds.items()}
+def milliseconds(action: Callable[[int], object], times: int) -> float:
+    """Return the median over turns of what one of many calls takes."""
+    turns = []
+    for turn in range(TURNS):
+        begin = time.perf_counter()
+        for i in range(times):
+            action(turn * times + i)
+        turns.append((time.perf_counter() - begin) / times)
+    return round(1e3 * statistics.median(turns), 4)
 
 
-def resident_bytes() -> int:
-    """Return the resident set of this process now."""
-    pages = int(Path("/proc/self/statm").read_text().split()[1])
-    return pages * resource.getpagesize()
+def with_visited(n_visited: int) -> dict[str, float]:
+    """Measure an agent whose store holds so many transitions."""
+    env = gym.make(TOY)
+    agent = SkillGraphAgent("MultiInputPolicy", env, seed=0).learn(TRAINED, log_interval=None)
+    store, rng = agent.parts.store, np.random.default_rng(0)
+    for _ in range(n_visited):
+        # The toy's observation and goal are positions.
+        here, there, action, goal = rng.uniform(-1.5, 1.5, (4, 1, 2)).astype(np.float32)
+        store.add(here, here, there, there, action, goal, np.zeros(1, bool), rng.random(1) < 0.01)
+    learning = milliseconds(lambda _: agent.learn(STRETCH, log_interval=None, reset_num_timesteps=False), 1) / STRETCH
+    observation, _ = env.reset(seed=0)
+    _, state = agent.predict(observation)
+    goals = [env.get_wrapper_attr("sample_free")(rng) for _ in range(1_000)]
+    return {
+        "visited": n_visited + TRAINED,
+        "learning_step_ms": round(learning, 4),
+        "predict_ms": milliseconds(lambda _: agent.predict(observation, state), 200),
+        "decision_ms": milliseconds(lambda i: agent.predict({**observation, "desired_goal": goals[i % 1_000]}), 50),
+    }
 
 
-def network_bytes(agent: SkillGraphAgent) -> int:
-    """Return what one option's networks, their targets and Adam's two moments take, once trained."""
-    policy = agent.global_option.learner.policy
-    assert isinstance(policy, TD3Policy)
-    learned = [*policy.actor.parameters(), *policy.critic.parameters()]
-    return 4 * (sum(p.numel() for p in policy.parameters()) + 2 * sum(p.numel() for p in learned))
+def square(n_events: int) -> Planner:
+    """Lay a graph over an open square: events on a jittered grid, walks to the nearest, most of them tried."""
+    rng = np.random.default_rng(0)
+    side = int(np.ceil(np.sqrt(n_events)))
+    graph = SkillGraph(2, 1.0, n_events)
+    cells = np.stack(np.meshgrid(np.arange(side), np.arange(side)), axis=-1).reshape(-1, 2)[:n_events]
+    for cell in cells:
+        graph.add_event(SPACING * (cell + rng.uniform(-0.2, 0.2, 2)), salient=False)
+    graph.now = 10_000.0
+    for i in range(n_events):
+        near = np.argsort(graph.distances(graph.centers[i]), kind="stable")[1 : MAX_DEGREE + 1]
+        for j in near.tolist():
+            steps = 5.0 * float(np.linalg.norm(graph.centers[i] - graph.centers[j]))
+            row = graph.edges.add(i, j, graph.now)
+            graph.edges.forward[row], graph.edges.crossing_steps[row] = 3.0, steps
+            for _ in range(rng.integers(0, 4)):
+                graph.ran(i, j, bool(rng.random() < 0.9), i, int(steps))
+    return Planner(graph, WalkModel(), 1_000)
 
 
-def transition_bytes(agent: SkillGraphAgent) -> float:
-    """Return what one transition takes in the store."""
-    store = agent.store
-    arrays = [value for value in vars(store).values() if isinstance(value, np.ndarray) and len(value) == store.capacity]
-    return sum(array.nbytes for array in arrays) / store.capacity
+def with_events(n_events: int) -> dict[str, float]:
+    """Measure plans over a graph of so many events."""
+    planner = square(n_events)
+    rng = np.random.default_rng(1)
+    size = SPACING * np.sqrt(n_events)
+    points = rng.uniform(0.0, size, (2_000, 2, 2))
 
+    def decide(i: int) -> None:
+        here, goal = points[i]
+        planner.solve(Start(here, planner.graph.locate(here)), goal)
 
-def exponent(sizes: list[int], times: list[float]) -> float:
-    """Return the slope of the line through the logarithms."""
-    return float(np.polyfit(np.log(sizes), np.log(times), 1)[0])
+    def plan(i: int) -> None:
+        here, goal = points[i]
+        start = Start(here, planner.graph.locate(here))
+        solution = planner.solve(start, goal)
+        planner.path(solution, solution.first())
+        planner.promise(solution, solution.first(), 1_000.0)
+
+    times = max(3, 2_000 // n_events)
+    result = {"events": n_events, "edges": planner.graph.edges.size}
+    return {**result, "decision_ms": milliseconds(decide, times), "plan_ms": milliseconds(plan, max(times // 4, 1))}
 
 
 def main() -> None:
-    """Print the table, and write it where ``--out`` says."""
-    parser = argparse.ArgumentParser(description="Time what grows with the number of options.")
-    parser.add_argument("--sizes", type=int, nargs="+", default=[10, 100, 1_000, 10_000], help="numbers of options")
-    parser.add_argument("--repeats", type=int, default=100, help="timings of each question")
-    parser.add_argument("--out", type=Path, help="JSON file for the results")
-    arguments = parser.parse_args()
+    """Run the benchmark."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, required=True)
+    args = parser.parse_args()
     th.set_num_threads(1)
-    rows: list[dict[str, Any]] = []
-    planes: list[Plane] = []
-    print(f"{'options':>8}{'edges':>8}{'degree':>8}" + "".join(f"{name:>12}" for name in TIMES) + f"{'graph kB/option':>17}")
-    for size in arguments.sizes:
-        gc.collect()
-        before = resident_bytes()
-        plane = Plane(size)
-        graph = plane.agent.graph
-        n_edges = graph.nx.number_of_edges()
-        degree = sum(graph.nx.out_degree(id) for id in graph.options) / size
-        row = {"options": size, "events": len(graph.events), "edges": n_edges, "out_degree": round(degree, 2)}
-        row["graph_bytes_per_option"] = round((resident_bytes() - before) / size)
-        row |= {name: round(value, 4) for name, value in plane.measure(arguments.repeats).items()}
-        rows.append(row)
-        planes.append(plane)
-    # All sizes take turns: what else the machine does hits them alike.
-    turns = [[plane.predict_seconds(20) for plane in planes] for _ in range(arguments.repeats)]
-    for row, column in zip(rows, zip(*turns, strict=True), strict=True):
-        row["predict_us"] = round(1e6 * statistics.median(column), 2)
-        missed = [f"{n} > {bars[row['options']]}" for n, bars in BARS.items() if row[n] > bars.get(row["options"], np.inf)]
-        print(
-            f"{row['options']:>8}{row['edges']:>8}{row['out_degree']:>8.1f}"
-            + "".join(f"{row[name]:>12.3f}" for name in TIMES)
-            + f"{row['graph_bytes_per_option'] / 1e3:>17.1f}  {', '.join(missed)}"
-        )
-    exponents = {name: round(exponent(arguments.sizes, [row[name] for row in rows]), 2) for name in TIMES}
-    print("growth exponents:", ", ".join(f"{name} {value}" for name, value in exponents.items()))
-    growth = round(statistics.median(turn[-1] / turn[0] for turn in turns), 3)
-    print(f"predict while an option runs, largest graph over smallest: {growth} (asked: at most 1.2)")
-    sizes = {
-        "network_bytes_per_option": network_bytes(planes[0].agent),
-        "bytes_per_transition": transition_bytes(planes[0].agent),
+    document = {
+        "command": f"python -m benchmarks.scaling --out {args.out}",
+        "visited": [with_visited(n) for n in VISITED],
+        "events": [with_events(n) for n in EVENTS],
     }
-    print(", ".join(f"{name}: {value:.0f}" for name, value in sizes.items()))
-    if arguments.out is not None:
-        arguments.out.parent.mkdir(parents=True, exist_ok=True)
-        results = {"rows": rows, "exponents": exponents, "predict_growth": growth, **sizes}
-        arguments.out.write_text(json.dumps(results, indent=1) + "\n")
+    args.out.parent.mkdir(parents=True, exist_ok=True)
+    args.out.write_text(json.dumps(document, indent=1) + "\n")
+    print(json.dumps(document, indent=1))
 
 
 if __name__ == "__main__":

@@ -19,7 +19,6 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 from stable_baselines3.td3.policies import MultiInputPolicy
 
 from sb3_skillgraph import persistence
-from sb3_skillgraph.choices import Stance
 from sb3_skillgraph.events import Event
 from sb3_skillgraph.goal_env import GoalSpec, as_batch, as_goal, check_finite, refuse_vec_normalize, rows, with_terminal
 from sb3_skillgraph.interrupts import Interrupts
@@ -418,7 +417,7 @@ class SkillGraphAgent(OffPolicyAlgorithm):
         target = batch["desired_goal"][0] if goal is None else as_goal(goal, self._spec.goal_dim)
         running = self._running_state(1, state)
         running, _ = self.parts.runner.advance(running, batch["achieved_goal"])
-        return describe(self.parts.runner, running, batch["achieved_goal"][0], target.astype(np.float32), Stance.PESSIMISTIC)
+        return describe(self.parts.runner, running, batch["achieved_goal"][0], target.astype(np.float32))
 
     def adapt(
         self: SelfSkillGraphAgent,
@@ -484,9 +483,7 @@ class SkillGraphAgent(OffPolicyAlgorithm):
             given = load_tree(given, "agent")["parameters"]
         self.parts.walker.learner.set_parameters(given, exact_match, device)
 
-    def save(
-        self, path: PathOrFile, exclude: Iterable[str] | None = None, include: Iterable[str] | None = None
-    ) -> None:
+    def save(self, path: PathOrFile, exclude: Iterable[str] | None = None, include: Iterable[str] | None = None) -> None:
         """
         Save everything but the replay buffer to one zip of JSON and ``.npy`` members.
 

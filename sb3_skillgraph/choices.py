@@ -1,6 +1,5 @@
 """What an agent could do in each event, and what would come of it: the model that plans are made on."""
 
-from enum import Enum
 from typing import NamedTuple
 
 import numpy as np
@@ -8,22 +7,21 @@ import numpy as np
 from sb3_skillgraph.graph import NOWHERE, SkillGraph
 from sb3_skillgraph.walk_model import Kind, WalkModel
 
+#: What to count on for the success of options, in standard deviations above what is expected: while learning, so that what is
+#: unknown is tried, and otherwise, so that it is not relied upon.
+OPTIMISTIC, EXPECTED, PESSIMISTIC = 1.0, 0.0, -0.5
 #: Runs that the model's guess counts for, beside those that there were.
 GUESS_RUNS = 2.0
 #: Runs that one run of the running episode counts for: it began nearest in time and place, and without noise.
 EPISODE_WEIGHT = 3.0
 #: Events nearest to a goal, or to a start, from which it is considered to walk there though nobody was seen to.
 NEAR_EVENTS = 6
+#: What a run tells of others that begin or end in the same event, in runs of their own; and of all of them, at most.
+KINSHIP, MOST_KINSHIP = 0.25, 2.0
+#: A failed run has landed far away where that is so many times further than it was to go.
+FAR = 2.0
 #: Share of the success of a walk to an event that is left for a goal beside its centre.
 BESIDE = 0.98
-
-
-class Stance(Enum):
-    """What to take for the success rate of an option, in standard deviations above its expectation."""
-
-    OPTIMISTIC = 1.0
-    EXPECTED = 0.0
-    PESSIMISTIC = -0.5
 
 
 class Runs(NamedTuple):
@@ -42,6 +40,11 @@ class Runs(NamedTuple):
     landing: np.ndarray
     count: np.ndarray
 
+    def of(self, source: int, target: int) -> list[tuple[bool, int, int]]:
+        """Return success, landing and count of the runs of one option from one event."""
+        rows = np.flatnonzero((self.source == source) & (self.target == target))
+        return [(bool(self.success[i]), int(self.landing[i]), int(self.count[i])) for i in rows]
+
 
 NO_RUNS = Runs(*np.zeros((5, 0), dtype=np.int64))
 
@@ -58,45 +61,23 @@ class Start(NamedTuple):
 
 
 class Choices(NamedTuple):
-    """What can be done where, and what comes of it; one row for each.
+    """What can be done where, and what is known of it; one row for each.
+
+    Vertices are numbered: the events by their indices, then the goal, then the start; ``NOWHERE`` is where one is lost.
 
     :param source: vertex where the option begins, shape ``(n,)``
     :param target: vertex where it leads
-    :param success: probability of that
-    :param steps: environment steps until then, if it succeeds
-    :param landing: vertices where failed runs land, shape ``(n, m)``
-    :param share: of the failures that land there, same shape; rows sum to 1
+    :param guess: success rate of its kind
+    :param successes: weight of its runs that succeeded
+    :param failures: weight of those that failed
+    :param steps: environment steps of a successful run
+    :param loss: share of the failures of its kind that end far away
+    :param landing: vertices in which failed runs landed, shape ``(n, MAX_LANDINGS)``
+    :param weight: weight of those, same shape
     """
 
     source: np.ndarray
     target: np.ndarray
-    success: np.ndarray
-    steps: np.ndarray
-    landing: np.ndarray
-    share: np.ndarray
-
-    def take(self, rows: np.ndarray) -> "Choices":
-        """Return some of the rows."""
-        return Choices(*(column[rows] for column in self))
-
-    @staticmethod
-    def join(parts: list["Choices"]) -> "Choices":
-        """Return the rows of all parts, one after the other."""
-        return Choices(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
-
-
-class Evidence(NamedTuple):
-    """What is known of the success of some options; arrays of shape ``(n,)``, landings ``(n, MAX_LANDINGS)``.
-
-    :param guess: success rate of their kind
-    :param successes: weight of the runs that succeeded
-    :param failures: weight of those that failed
-    :param steps: environment steps of a successful run
-    :param loss: share of the failures of their kind that end far away
-    :param landing: events in which failed runs landed
-    :param weight: weight of those
-    """
-
     guess: np.ndarray
     successes: np.ndarray
     failures: np.ndarray
@@ -105,17 +86,50 @@ class Evidence(NamedTuple):
     landing: np.ndarray
     weight: np.ndarray
 
-    def success(self, stance: Stance) -> np.ndarray:
-        """Return the rate to count on: of the Beta distribution that guess and runs make, mean and deviation."""
+    def success(self, stance: float) -> np.ndarray:
+        """Return the rate to count on: of the Beta distribution that guess and runs make, mean and deviation.
+
+        :param stance: how many standard deviations to add to the mean
+        """
         runs = GUESS_RUNS + self.successes + self.failures
         mean = (GUESS_RUNS * self.guess + self.successes) / runs
-        return np.clip(mean + stance.value * np.sqrt(mean * (1.0 - mean) / (runs + 1.0)), 0.0, 1.0)
+        return np.clip(mean + stance * np.sqrt(mean * (1.0 - mean) / (runs + 1.0)), 0.0, 1.0)
+
+    def landings(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return where failures land: where they did, and, a failure's worth, as those of their kind do.
+
+        :return: vertices, shape ``(n, m)``, and the shares of the failures, whose rows sum to 1
+        """
+        nowhere = np.full_like(self.source, NOWHERE)
+        landing = np.concatenate([self.landing, np.stack([self.source, nowhere], axis=1)], axis=1)
+        # Those of the kind end near where they began, or are lost.
+        share = np.concatenate([self.weight, np.stack([1.0 - self.loss, self.loss], axis=1)], axis=1)
+        return landing, share / share.sum(axis=1, keepdims=True)
+
+    def take(self, rows: np.ndarray) -> "Choices":
+        """Return a copy of some of the rows."""
+        return Choices(*(column[rows] for column in self))
+
+    @staticmethod
+    def join(parts: list["Choices"]) -> "Choices":
+        """Return the rows of all parts, one after the other."""
+        return Choices(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+
+    def count(self, row: int, success: bool, landing: int, weight: float) -> None:
+        """Add runs to a row, in place."""
+        if success:
+            self.successes[row] += weight
+            return
+        self.failures[row] += weight
+        landings, weights = self.landing[row], self.weight[row]
+        known = np.flatnonzero((landings == landing) & (weights > 0.0))
+        slot = int(known[0]) if len(known) else int(weights.argmin())
+        landings[slot] = landing
+        weights[slot] += weight
 
 
 class ChoiceModel:
     """Makes choices out of the graph's records.
-
-    Vertices are numbered: the events by their indices, then the goal, then the start; ``NOWHERE`` is where one is lost.
 
     :param graph: the skill graph
     :param model: what to expect of walks that have not been tried
@@ -124,7 +138,20 @@ class ChoiceModel:
     def __init__(self, graph: SkillGraph, model: WalkModel) -> None:
         self.graph = graph
         self.model = model
-        self._evidence: tuple[tuple[int, int], Evidence] | None = None
+        self._walks: tuple[tuple[int, int], Choices] | None = None
+
+    @property
+    def version(self) -> tuple[int, int]:
+        """Changes whenever something is learned."""
+        return self.graph.version, self.model.version
+
+    # -- walks between events -----------------------------------------------------------------------------------------
+
+    def walks(self) -> Choices:
+        """Return what training has shown of each edge, in the order of the graph's edges (not to be changed)."""
+        if self._walks is None or self._walks[0] != self.version:
+            self._walks = self.version, self._gather()
+        return self._walks[1]
 
     def kinds(self) -> Kind:
         """Return what is known of the graph's walks beside their runs."""
@@ -133,69 +160,82 @@ class ChoiceModel:
         distance = np.linalg.norm(offsets, axis=1) / graph.radius
         return Kind(distance, edges.crossing_steps, edges.forward, edges.backward)
 
-    def choices(self, start: Start, goal: np.ndarray, runs: Runs, stance: Stance) -> Choices:
-        """Return everything that can be done on the way from a start to a goal.
-
-        :param start: where the agent stands
-        :param goal: shape ``(goal_dim,)``
-        :param runs: what has happened in this episode
-        :param stance: what to count on
-        :return: the choices in events first, those of the start last
-        """
-        walks = self._walks(runs, stance)
-        to_goal = self._to_goal(walks, goal, runs, stance)
-        everywhere = Choices.join([walks, to_goal])
-        return Choices.join([everywhere, self._at_start(everywhere, start, goal, runs, stance)])
-
-    # -- walks between events -----------------------------------------------------------------------------------------
-
-    def evidence(self) -> Evidence:
-        """Return what training has shown of each edge of the graph (worked out anew when something was learned)."""
-        key = self.graph.version, self.model.version
-        if self._evidence is None or self._evidence[0] != key:
-            self._evidence = key, self._gather()
-        return self._evidence[1]
-
-    def _gather(self) -> Evidence:
+    def _gather(self) -> Choices:
         edges, aging, kinds = self.graph.edges, self.graph.aging(), self.kinds()
         successes, failures = edges.successes * aging, edges.failures * aging
+        guess = self._with_kin(self.model.success(kinds), successes, successes + failures)
         # A guess of the steps counts for one run.
         steps = (self.model.steps(kinds) + edges.success_steps * aging) / (1.0 + successes)
+        loss = self._with_kin(self._loss(kinds), self.far_failures(kinds), failures)
         weight = edges.landing_weight * aging[:, None]
-        loss = self._loss(kinds)
-        return Evidence(self.model.success(kinds), successes, failures, steps, loss, edges.landing, weight)
+        return Choices(edges.source, edges.target, guess, successes, failures, steps, loss, edges.landing, weight)
 
     def _loss(self, kinds: Kind) -> np.ndarray:
         return np.where(self.model.is_hasty(kinds), self.model.loss[0], self.model.loss[1])
 
-    def _walks(self, runs: Runs, stance: Stance) -> Choices:
-        evidence, edges = self.evidence(), self.graph.edges
-        if len(runs.source):
-            evidence = self._with_episode(evidence, runs)
-        return self._choices(edges.source, edges.target, evidence, stance)
+    def _with_kin(self, guess: np.ndarray, hits: np.ndarray, runs: np.ndarray) -> np.ndarray:
+        """Return a guessed share, corrected by the runs of other edges out of the same event, and into the same one.
 
-    def _with_episode(self, evidence: Evidence, runs: Runs) -> Evidence:
-        """Count the runs of the episode as well."""
-        counted = Evidence(*(column.copy() for column in evidence))
-        for source, target, success, landing, count in zip(*(column.tolist() for column in runs), strict=True):
-            row = self.graph.edges.find(source, target)
-            if row is not None:
-                _count(counted, row, success, landing, EPISODE_WEIGHT * count)
-        return counted
+        :param guess: shape ``(n_edges,)``
+        :param hits: weight of the runs of each edge of which the share is guessed
+        :param runs: weight of all of its runs
+        """
+        edges, n_events = self.graph.edges, len(self.graph.events)
+        total, weight = GUESS_RUNS * guess, np.full(len(guess), GUESS_RUNS)
+        for ends in (edges.source, edges.target):
+            kin_hits = np.bincount(ends, hits, n_events)[ends] - hits
+            kin_runs = np.bincount(ends, runs, n_events)[ends] - runs
+            scale = np.minimum(KINSHIP, MOST_KINSHIP / np.maximum(kin_runs, 1e-9))
+            total += scale * kin_hits
+            weight += scale * kin_runs
+        return np.clip(total / weight, 0.0, 1.0)
 
-    def _choices(self, source: np.ndarray, target: np.ndarray, evidence: Evidence, stance: Stance) -> Choices:
-        """Return choices whose failures land where they did, and besides as those of their kind do."""
-        loss = evidence.loss
-        # One failure's worth of the kind: near where it began, or lost.
-        share = np.concatenate([evidence.weight, (1.0 - loss)[:, None], loss[:, None]], axis=1)
-        share /= share.sum(axis=1, keepdims=True)
-        near, lost = source[:, None], np.full((len(source), 1), NOWHERE)
-        landing = np.concatenate([evidence.landing, near, lost], axis=1)
-        return Choices(source, target, evidence.success(stance), evidence.steps, landing, share)
+    def far_failures(self, kinds: Kind) -> np.ndarray:
+        """Return the weight of the failed runs of each edge that landed far away or nowhere, shape ``(n_edges,)``.
 
-    # -- the goal -----------------------------------------------------------------------------------------------------
+        :param kinds: of the edges
+        """
+        graph, edges = self.graph, self.graph.edges
+        rows = np.flatnonzero(edges.failures > 0.0)
+        # With one entry more than there are events: NOWHERE is infinitely far away.
+        centers = np.concatenate([graph.centers, np.full((1, graph.goal_dim), np.inf)])
+        away = np.linalg.norm(centers[edges.landing[rows]] - graph.centers[edges.source[rows]][:, None], axis=2)
+        far = away > FAR * (kinds.distance[rows, None] + 1.0) * graph.radius
+        result = np.zeros(edges.size)
+        result[rows] = (edges.landing_weight[rows] * far).sum(axis=1) * graph.aging()[rows]
+        return result
 
-    def _to_goal(self, walks: Choices, goal: np.ndarray, runs: Runs, stance: Stance) -> Choices:
+    # -- what an episode adds -----------------------------------------------------------------------------------------
+
+    def of_episode(self, start: Start, goal: np.ndarray, runs: Runs) -> tuple[np.ndarray, Choices]:
+        """Return what can be done beside what training has shown.
+
+        :param start: where the agent stands
+        :param goal: shape ``(goal_dim,)``
+        :param runs: what has happened in this episode
+        :return: edges that the episode has shown more of, and the choices that take their place or come on top: those, the
+            walks to the goal, and last what can be done at the start
+        """
+        replaced, tried = self._tried(runs)
+        to_goal = self._to_goal(replaced, tried, goal, runs)
+        return replaced, Choices.join([tried, to_goal, self._at_start(replaced, tried, to_goal, start, goal, runs)])
+
+    def _tried(self, runs: Runs) -> tuple[np.ndarray, Choices]:
+        """Return the edges that the episode has runs of, and what is known of them with those."""
+        found = (self.graph.edges.find(u, v) for u, v in zip(runs.source.tolist(), runs.target.tolist(), strict=True))
+        replaced = np.unique(np.array([row for row in found if row is not None], dtype=np.int64))
+        tried = self.walks().take(replaced)
+        for i, (source, target) in enumerate(zip(tried.source.tolist(), tried.target.tolist(), strict=True)):
+            for success, landing, count in runs.of(source, target):
+                tried.count(i, success, landing, EPISODE_WEIGHT * count)
+        return replaced, tried
+
+    def _edges(self, chosen: np.ndarray, replaced: np.ndarray, tried: Choices) -> Choices:
+        """Return some of the graph's edges, with what the episode has shown of them."""
+        rows = np.flatnonzero(chosen)
+        return Choices.join([self.walks().take(rows[~np.isin(rows, replaced)]), tried.take(chosen[replaced])])
+
+    def _to_goal(self, replaced: np.ndarray, tried: Choices, goal: np.ndarray, runs: Runs) -> Choices:
         """Return the walks to the goal itself, from events.
 
         Where the goal belongs to an event, whoever can walk to that can walk to the goal as well. Otherwise, and from
@@ -206,19 +246,22 @@ class ChoiceModel:
         home = graph.locate(goal)
         near = np.argsort(distance, kind="stable")[:NEAR_EVENTS]
         seen = (near == home).astype(np.float64)  # somebody was near the goal, in its event
-        parts = [self._guessed(near, near, vertex, distance[near], seen, runs, stance)]
-        if home != NOWHERE:
-            rows = np.flatnonzero(walks.target == home)
-            between = np.maximum(graph.distances(graph.centers[home])[walks.source[rows]], 1e-9)
-            stretch = np.clip(distance[walks.source[rows]] / between, 0.5, 2.0)
-            copies = walks.take(rows)
-            # What has been tried in this episode is known better from the guesses.
-            untried = ~np.isin(copies.source, runs.source[runs.target == vertex]) & ~np.isin(copies.source, near)
-            copies = copies._replace(
-                target=np.full(len(rows), vertex), success=BESIDE * copies.success, steps=stretch * copies.steps
-            )
-            parts.append(copies.take(untried))
-        return Choices.join(parts)
+        guessed = self._guessed(near, near, vertex, distance[near], seen, runs)
+        if home == NOWHERE:
+            return guessed
+        walks = self._edges(graph.edges.target == home, replaced, tried)
+        # What has been tried in this episode is known better from the guesses.
+        untried = ~np.isin(walks.source, runs.source[runs.target == vertex]) & ~np.isin(walks.source, near)
+        walks = walks.take(untried)
+        between = np.maximum(np.linalg.norm(graph.centers[walks.source] - graph.centers[home], axis=1), 1e-9)
+        stretch = np.clip(distance[walks.source] / between, 0.5, 2.0)
+        beside = walks._replace(
+            target=np.full(len(walks.target), vertex),
+            guess=BESIDE * walks.guess,
+            successes=BESIDE * walks.successes,
+            steps=stretch * walks.steps,
+        )
+        return Choices.join([guessed, beside])
 
     def _guessed(
         self,
@@ -228,73 +271,56 @@ class ChoiceModel:
         distance: np.ndarray,
         seen: np.ndarray,
         runs: Runs,
-        stance: Stance,
     ) -> Choices:
         """Return walks that no edge stands for, by their distance and what the episode has shown.
 
-        :param source: vertices where they begin
+        :param source: vertices where they begin, shape ``(n,)``
         :param event: events that runs of them are recorded for
-        :param target: where they lead
+        :param target: vertices where they lead
         :param distance: in goal units
         :param seen: 1 where somebody has been near the target, 0 elsewhere
+        :param runs: of the episode
         """
         n, radii = len(source), distance / self.graph.radius
-        steps = seen * self.model.steps_per_radius * radii
-        kind = Kind(radii, steps, seen, np.zeros(n))
+        kind = Kind(radii, seen * self.model.steps_per_radius * radii, seen, np.zeros(n))
         landing = np.full((n, self.graph.edges.landing.shape[1]), NOWHERE)
-        none = np.zeros(n)
-        evidence = Evidence(
+        targets = np.broadcast_to(np.asarray(target), (n,)).copy()
+        zeros = (np.zeros(n), np.zeros(n))
+        guessed = Choices(
+            source,
+            targets,
             self.model.success(kind),
-            none,
-            none.copy(),
+            *zeros,
             self.model.steps(kind),
             self._loss(kind),
             landing,
             np.zeros(landing.shape),
         )
-        targets = np.broadcast_to(np.asarray(target), (n,)).copy()
         for i, (begin, end) in enumerate(zip(event.tolist(), targets.tolist(), strict=True)):
-            for run in np.flatnonzero((runs.source == begin) & (runs.target == end)).tolist():
-                _count(evidence, i, bool(runs.success[run]), int(runs.landing[run]), EPISODE_WEIGHT * runs.count[run])
-        return self._choices(source, targets, evidence, stance)
+            for success, where, count in runs.of(begin, end):
+                guessed.count(i, success, where, EPISODE_WEIGHT * count)
+        return guessed
 
-    # -- the start ----------------------------------------------------------------------------------------------------
-
-    def _at_start(self, everywhere: Choices, start: Start, goal: np.ndarray, runs: Runs, stance: Stance) -> Choices:
+    def _at_start(
+        self, replaced: np.ndarray, tried: Choices, to_goal: Choices, start: Start, goal: np.ndarray, runs: Runs
+    ) -> Choices:
         """Return what can be done at the start: what can be done in its event, and walks that always can be tried."""
         graph, n_events = self.graph, len(self.graph.events)
-        vertex = n_events + 1
-        here = everywhere.take(np.flatnonzero(everywhere.source == start.event)[: len(everywhere.source)])
-        if start.event == NOWHERE:
-            here = here.take(np.zeros(0, dtype=np.int64))
-        parts = [here._replace(source=np.full(len(here.source), vertex))]
-        one = np.array([vertex])
+        here, distances = np.array([n_events + 1]), graph.distances(start.point)
         event = np.array([start.event])
-        if not (here.target == n_events).any():
-            distance = np.array([np.linalg.norm(goal - start.point)])
-            parts.append(self._guessed(one, event, n_events, distance, np.zeros(1), runs, stance))
-        distances = graph.distances(start.point)
-        if start.event == NOWHERE:
-            near = np.argsort(distances, kind="stable")[:NEAR_EVENTS]
-            source, events = np.full(len(near), vertex), np.full(len(near), NOWHERE)
-            parts.append(self._guessed(source, events, near, distances[near], np.zeros(len(near)), runs, stance))
-        elif distances[start.event] > graph.radius:
-            # At the edge of its event: to walk to the middle first may help.
-            parts.append(self._guessed(one, event, start.event, distances[event], np.ones(1), runs, stance))
-        joined = Choices.join(parts)
+        parts = []
         if start.event != NOWHERE:
-            joined.landing[joined.landing == vertex] = start.event
-        return joined
-
-
-def _count(evidence: Evidence, row: int, success: bool, landing: int, weight: float) -> None:
-    """Add runs to a row of the evidence, in place."""
-    if success:
-        evidence.successes[row] += weight
-        return
-    evidence.failures[row] += weight
-    landings, weights = evidence.landing[row], evidence.weight[row]
-    known = np.flatnonzero((landings == landing) & (weights > 0.0))
-    slot = int(known[0]) if len(known) else int(weights.argmin())
-    landings[slot] = landing
-    weights[slot] += weight
+            parts += [self._edges(graph.edges.source == start.event, replaced, tried)]
+            parts += [to_goal.take(to_goal.source == start.event)]
+            if distances[start.event] > graph.radius:
+                # At the edge of its event: to walk to the middle first may help.
+                parts.append(self._guessed(here, event, start.event, distances[event], np.ones(1), runs))
+        else:
+            near = np.argsort(distances, kind="stable")[:NEAR_EVENTS]
+            nowhere = np.full(len(near), NOWHERE)
+            parts.append(self._guessed(near, nowhere, near, distances[near], np.zeros(len(near)), runs))
+        if not any((part.target == n_events).any() for part in parts):
+            distance = np.array([np.linalg.norm(goal - start.point)])
+            parts.append(self._guessed(here, event, n_events, distance, np.zeros(1), runs))
+        choices = Choices.join(parts)
+        return choices._replace(source=np.full(len(choices.source), n_events + 1))

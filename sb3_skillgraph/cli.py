@@ -232,9 +232,7 @@ def _demo(args: argparse.Namespace) -> int:
         "the same walker, straight on": StraightOn(agent),
         "random walk": RandomWalk(agent.action_space, args.seed),
     }
-    results = {
-        name: evaluate_pairs(method, DEMO_ENV, n_pairs=args.pairs, seed=args.seed) for name, method in methods.items()
-    }
+    results = {name: evaluate_pairs(method, DEMO_ENV, n_pairs=args.pairs, seed=args.seed) for name, method in methods.items()}
     _print_table(DEMO_ENV, results)
     write_json(args.out / "results.json", {name: _as_plain(result) for name, result in results.items()})
     # The longest way that succeeded shows the most; failing all, the longest.

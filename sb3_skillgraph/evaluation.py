@@ -216,7 +216,9 @@ def evaluate_pairs(
     made = gym.make(env, **(env_kwargs or {})) if isinstance(env, str) else env
     try:
         if not made.has_wrapper_attr("geometry"):
-            raise NoPairsError(f"Pairs are drawn from the walls of a maze: that needs a SkillGraph/* environment, not {env!r}.")
+            raise NoPairsError(
+                f"Pairs are drawn from the walls of a maze: that needs a SkillGraph/* environment, not {env!r}."
+            )
         drawn = sample_pairs(made.get_wrapper_attr("geometry"), made.get_wrapper_attr("body_radius"), n_pairs, seed)
         made.reset(seed=seed)
         results = []

@@ -12,7 +12,7 @@ from sb3_skillgraph.events import Event
 NOWHERE = -1
 #: Landmarks lie at least so many event radii apart: 1.5 to 3 make the same agent, fewer make plans cheaper.
 SPACING = 1.5
-#: Edges out of an event, at most; a plan looks at all of them.
+#: Edges out of an event, at most (a few more until they are next looked through); a plan looks at all of them.
 MAX_DEGREE = 24
 #: Different events in which failed runs of one edge have landed that are told apart.
 MAX_LANDINGS = 4
@@ -119,7 +119,6 @@ class SkillGraph:
         self.goal_dim = goal_dim
         self.radius = radius
         self.max_events = max_events
-        self.max_degree = MAX_DEGREE
         self.cover_radius = SPACING * radius
         self.events: list[Event] = []
         self.edges = Edges()
@@ -303,20 +302,18 @@ class SkillGraph:
             landings[slot], weights[slot] = landing, 0.0
         weights[slot] += weight
 
-    def degree(self, source: int) -> int:
-        """Return how many edges lead out of an event."""
-        return int(np.count_nonzero(self.edges.source == source))
+    def bound_degree(self, worth: np.ndarray) -> None:
+        """Let go of the edges of each event that are worth least, where it has too many.
 
-    def bound_degree(self, source: int, worth: np.ndarray) -> None:
-        """Let go of the edges of an event that are worth least, if it has too many.
-
-        :param source: index of the event
         :param worth: of every edge, shape ``(n_edges,)``
         """
-        rows = np.flatnonzero(self.edges.source == source)
-        if len(rows) > self.max_degree:
-            dropped = rows[np.argsort(worth[rows], kind="stable")[: len(rows) - self.max_degree]]
-            self.edges.keep(np.delete(np.arange(self.edges.size), dropped))
+        source = self.edges.source
+        order = np.lexsort((-worth, source))  # by source, those of most worth first; of equals the oldest
+        ordered = source[order]
+        first = np.searchsorted(ordered, ordered)  # where the edges of the same source begin
+        rank = np.arange(len(order)) - first
+        if (rank >= MAX_DEGREE).any():
+            self.edges.keep(np.sort(order[rank < MAX_DEGREE]))
             self.version += 1
 
     # -- looking at it ------------------------------------------------------------------------------------------------

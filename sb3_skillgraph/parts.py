@@ -34,9 +34,7 @@ SATURATION_PENALTY = 1e-4
 HORIZON = 1_000
 #: Steps ahead from which hindsight draws achieved goals.
 HINDSIGHT_STEPS = 200
-OPTION_CLASSES: dict[str, type[OffPolicyAlgorithm]] = {
-    cls.__name__: cls for cls in (OptionDDPG, OptionTD3, DDPG, TD3, SAC)
-}
+OPTION_CLASSES: dict[str, type[OffPolicyAlgorithm]] = {cls.__name__: cls for cls in (OptionDDPG, OptionTD3, DDPG, TD3, SAC)}
 
 
 @dataclass
@@ -106,9 +104,7 @@ class Parts:
             arguments["random_action_prob"],
             rng,
         )
-        return cls(
-            rng, view_name, factory, store, walker, graph, model, planner, runner, missions, witness, rollout
-        )
+        return cls(rng, view_name, factory, store, walker, graph, model, planner, runner, missions, witness, rollout)
 
     def unscale(self, scaled: np.ndarray) -> np.ndarray:
         """Turn actions in [-1, 1], shape ``(n, action_dim)``, into the environment's own, shape ``(n, *action_shape)``."""
@@ -229,5 +225,3 @@ def _salience(arguments: dict[str, Any], graph: SkillGraph, store: TransitionSto
             "returns a point of goal space."
         )
     return salience
-
-

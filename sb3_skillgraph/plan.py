@@ -4,7 +4,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from sb3_skillgraph.choices import Stance
+from sb3_skillgraph.choices import PESSIMISTIC
 from sb3_skillgraph.graph import NOWHERE
 from sb3_skillgraph.planning import DIRECT, GOAL, Solution
 from sb3_skillgraph.runner import Runner, RunnerState
@@ -39,39 +39,34 @@ class Plan(NamedTuple):
         return f"{known}: go there{by_way}, {steps}, success {self.success_probability:.0%}."
 
 
-def describe(runner: Runner, state: RunnerState, point: np.ndarray, goal: np.ndarray, stance: Stance) -> Plan:
+def describe(runner: Runner, state: RunnerState, point: np.ndarray, goal: np.ndarray) -> Plan:
     """Make the plan that the runner follows.
 
     :param runner: runs options
     :param state: of one environment, advanced to this step
     :param point: where the agent stands, shape ``(goal_dim,)``
     :param goal: shape ``(goal_dim,)``
-    :param stance: what the plan counts on
     :return: the plan; its first option is the one that runs, or would be begun
     """
-    start = runner.start(state, 0, point)
-    planner, runs = runner.planner, runner.runs(state, 0)
-    solution = planner.solve(start, goal.astype(np.float64), runs, stance)
+    solution = runner.decide(state, 0, runner.start(state, 0, point), goal, PESSIMISTIC)
     first = _running(runner, state, solution) if state.option[0] else solution.first()
-    rows = planner.path(solution, first)
-    remaining = max(planner.horizon - float(state.elapsed[0]), 1.0)
-    probability, steps = planner.promise(start, goal.astype(np.float64), runs, solution, first, remaining)
-    return Plan(_status(runner, goal), _ids(runner, solution, rows), steps, probability)
+    targets = runner.planner.path(solution, first)
+    remaining = max(runner.planner.horizon - float(state.elapsed[0]), 1.0)
+    probability, steps = runner.planner.promise(solution, first, remaining)
+    return Plan(_status(runner, goal), _ids(runner, solution, targets), steps, probability)
 
 
 def _running(runner: Runner, state: RunnerState, solution: Solution) -> int:
     """Return the choice at the start that stands for the running option."""
-    option = str(state.option[0])
+    option, episode = str(state.option[0]), solution.episode
     target = solution.goal if option == DIRECT else runner.graph.index(option)
-    at_start = solution.choices.source == solution.start
-    rows = np.flatnonzero(at_start & (solution.choices.target == target))
+    rows = np.flatnonzero((episode.source == solution.start) & (episode.target == target))
     return int(rows[0]) if len(rows) else solution.first()
 
 
-def _ids(runner: Runner, solution: Solution, rows: list[int]) -> tuple[str, ...]:
+def _ids(runner: Runner, solution: Solution, targets: list[int]) -> tuple[str, ...]:
     graph, ids = runner.graph, []
-    for row in rows:
-        target = int(solution.choices.target[row])
+    for target in targets:
         ids += [DIRECT, GOAL] if target == solution.goal else [graph.walk_ids[target], graph.events[target].id]
     return tuple(ids)
 

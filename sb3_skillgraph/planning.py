@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.sparse import csr_array
 
-from sb3_skillgraph.choices import NO_RUNS, ChoiceModel, Choices, Runs, Stance, Start
+from sb3_skillgraph.choices import EXPECTED, NO_RUNS, PESSIMISTIC, ChoiceModel, Choices, Runs, Start
 from sb3_skillgraph.graph import NOWHERE, SkillGraph
 from sb3_skillgraph.walk_model import WalkModel
 
@@ -19,8 +19,10 @@ LOST_HORIZONS = 10.0
 PRECISION, MAX_SWEEPS = 0.5, 300
 #: Bins of time in which the success within the horizon is worked out.
 TIME_BINS = 200
-#: Values that are remembered, until something is learned or happens.
-MEMORY = 32
+#: Share of the failures that will happen again and again: what a policy without noise cannot do from some place it never can.
+FOR_GOOD = 0.05
+#: Opinions of how well options do, in standard deviations: as far apart as the fifths of a normal distribution.
+OPINIONS = (-1.28, -0.52, 0.0, 0.52, 1.28)
 
 
 def timeout(steps: float | np.ndarray) -> float | np.ndarray:
@@ -28,17 +30,79 @@ def timeout(steps: float | np.ndarray) -> float | np.ndarray:
     return 2.0 * steps + 15.0
 
 
-class Solution(NamedTuple):
-    """The values of all vertices, and the choices they rest on.
+class Linear(NamedTuple):
+    """What choices cost, as a linear function of the values of all vertices.
 
-    :param choices: of all vertices; those of the start come last
-    :param values: environment steps to the goal from each event, the goal (0), the start, and nowhere (lost)
-    :param costs: the same by way of each choice, shape ``(n_choices,)``
+    :param constant: environment steps that they take themselves, shape ``(n,)``
+    :param matrix: probabilities of where they end, shape ``(n, n_vertices)``
     """
 
-    choices: Choices
+    constant: np.ndarray
+    matrix: csr_array
+
+    @classmethod
+    def of(cls, choices: Choices, stance: float, n_vertices: int) -> "Linear":
+        """Work out choices.
+
+        Runs that end where they began are repeated: what is returned is of the run that gets somewhere.
+
+        :param choices: what can be done
+        :param stance: what to count on, in standard deviations above what is expected
+        :param n_vertices: number of all vertices
+        """
+        success = choices.success(stance)
+        failure = 1.0 - success
+        landing, share = choices.landings()
+        steps = success * choices.steps + failure * timeout(choices.steps)
+        probability = np.concatenate([success[:, None], failure[:, None] * share], axis=1)
+        ends = np.concatenate([choices.target[:, None], landing], axis=1)
+        stays = ends == choices.source[:, None]
+        goes = np.maximum(1.0 - (probability * stays).sum(axis=1), 1e-9)
+        probability[stays] = 0.0
+        probability /= goes[:, None]
+        # Sparse: most choices end in two or three vertices.
+        rows, columns = np.nonzero(probability)
+        entries = probability[rows, columns], (rows, ends[rows, columns] % n_vertices)
+        return cls(steps / goes, csr_array(entries, shape=(len(steps), n_vertices)))
+
+    def costs(self, values: np.ndarray) -> np.ndarray:
+        """Return what each choice costs.
+
+        :param values: of all vertices
+        """
+        return self.constant + self.matrix @ values
+
+
+class Known(NamedTuple):
+    """What training has shown, worked out once for all goals; choices are sorted by their source.
+
+    :param order: rows of the graph's edges in this order
+    :param linear: what they cost
+    :param sources: the vertices that have any
+    :param first: where the choices of each of those begin
+    """
+
+    order: np.ndarray
+    linear: Linear
+    sources: np.ndarray
+    first: np.ndarray
+
+
+class Solution(NamedTuple):
+    """The values of all vertices, and what can be done on the way.
+
+    :param values: environment steps to the goal from each event, the goal (0), the start, and nowhere (lost)
+    :param walks: what training has shown of each edge of the graph
+    :param walk_costs: steps to the goal by way of each; infinite where the episode has shown more
+    :param episode: what the episode adds; what can be done at the start comes last
+    :param episode_costs: the same for these
+    """
+
     values: np.ndarray
-    costs: np.ndarray
+    walks: Choices
+    walk_costs: np.ndarray
+    episode: Choices
+    episode_costs: np.ndarray
 
     @property
     def goal(self) -> int:
@@ -50,18 +114,30 @@ class Solution(NamedTuple):
         """The vertex where the plan begins."""
         return len(self.values) - 2
 
+    @property
+    def choices(self) -> Choices:
+        """All that can be done: the walks, then what the episode adds."""
+        return Choices.join([self.walks, self.episode])
+
     def first(self) -> int:
-        """Return the choice at the start; of equals the walk to the goal, else the first."""
-        rows = np.flatnonzero(self.choices.source == self.start)
-        cheapest = rows[self.costs[rows] <= self.costs[rows].min()]
-        direct = cheapest[self.choices.target[cheapest] == self.goal]
+        """Return the row, among those of the episode, of the first option: of equals the walk to the goal, else the first."""
+        rows = np.flatnonzero(self.episode.source == self.start)
+        cheapest = rows[self.episode_costs[rows] <= self.episode_costs[rows].min()]
+        direct = cheapest[self.episode.target[cheapest] == self.goal]
         return int(direct[0] if len(direct) else cheapest[0])
 
-    def best(self) -> np.ndarray:
-        """Return the choice at each vertex, shape of ``values``; ``-1`` where there is none, the first of equals."""
+    def best(self, first: int) -> np.ndarray:
+        """Return the row of the choice at each vertex, shape of ``values``: the cheapest, the first of equals.
+
+        :param first: the row, among those of the episode, of the choice at the start
+        :return: rows of ``choices``; ``-1`` where there is none
+        """
+        source = np.concatenate([self.walks.source, self.episode.source])
+        costs = np.concatenate([self.walk_costs, self.episode_costs])
         best = np.full(len(self.values), -1)
-        rows = np.lexsort((-np.arange(len(self.costs)), -self.costs))  # the cheapest is written last
-        best[self.choices.source[rows]] = rows
+        rows = np.lexsort((-np.arange(len(costs)), -costs))  # the cheapest is written last
+        best[source[rows]] = rows
+        best[self.start] = len(self.walk_costs) + first
         return best
 
 
@@ -77,127 +153,146 @@ class Planner:
         self.graph = graph
         self.choice_model = ChoiceModel(graph, model)
         self.horizon = horizon
-        self.lost = LOST_HORIZONS * horizon
-        self._memory: dict[tuple[object, ...], Solution] = {}
+        self._known: dict[float, tuple[tuple[int, int], Known]] = {}
 
-    def solve(self, start: Start, goal: np.ndarray, runs: Runs = NO_RUNS, stance: Stance = Stance.PESSIMISTIC) -> Solution:
+    @property
+    def lost(self) -> float:
+        """What it costs to be lost, in environment steps."""
+        return LOST_HORIZONS * self.horizon
+
+    def solve(self, start: Start, goal: np.ndarray, runs: Runs = NO_RUNS, stance: float = PESSIMISTIC) -> Solution:
         """Work out what it costs to get to a goal, by value iteration.
 
-        It is a function of the graph and what is given here, and of nothing else. Time: sweeps, about as many as a way
-        has options, of one product of a sparse matrix each.
+        It begins from above: everything is lost, but for the goal; what a sweep finds is a way that can be gone. The
+        result is a function of the graph and what is given here, and of nothing else. Time: sweeps, about as many as a
+        way has options, of one product of a sparse matrix each.
 
         :param start: where the agent stands
         :param goal: shape ``(goal_dim,)``
         :param runs: what has happened in this episode
-        :param stance: what to count on
+        :param stance: what to count on, in standard deviations above what is expected
         """
-        versions = self.graph.version, self.choice_model.model.version
-        key = (*versions, stance, start.event, start.point.tobytes(), goal.tobytes(), *(c.tobytes() for c in runs))
-        if key not in self._memory:
-            if len(self._memory) >= MEMORY:
-                self._memory.clear()
-            self._memory[key] = self._solve(self.choice_model.choices(start, goal, runs, stance))
-        return self._memory[key]
-
-    def _solve(self, choices: Choices) -> Solution:
-        """Iterate from above: everything is lost, but for the goal; what a sweep finds is a way that can be gone."""
         n_events = len(self.graph.events)
-        constant, matrix = self._as_linear(choices, n_events + 3)
-        order = np.argsort(choices.source, kind="stable")
-        sources, first = np.unique(choices.source[order], return_index=True)
-        constant, matrix = constant[order], matrix[order]
-        values = np.full(n_events + 3, self.lost)
+        n_vertices = n_events + 3
+        known, walks = self._worked_out(stance), self.choice_model.walks()
+        replaced, episode = self.choice_model.of_episode(start, goal, runs)
+        constant = known.linear.constant
+        if len(replaced):
+            constant = np.where(np.isin(known.order, replaced), np.inf, constant)
+        linear = Linear.of(episode, stance, n_vertices)
+        values = np.full(n_vertices, self.lost)
         values[n_events] = 0.0
         for _ in range(MAX_SWEEPS):
-            costs = np.minimum(constant + matrix @ values, self.lost)
-            before = values[sources]
-            values[sources] = np.minimum.reduceat(costs, first)
-            if (before - values[sources]).max(initial=0.0) < PRECISION:
+            before = values
+            values = np.full(n_vertices, self.lost)
+            costs, episode_costs = constant + known.linear.matrix @ before, linear.costs(before)
+            if len(known.first):
+                values[known.sources] = np.minimum(np.minimum.reduceat(costs, known.first), self.lost)
+            np.minimum.at(values, episode.source, episode_costs)
+            values[n_events] = 0.0
+            if (before - values).max() < PRECISION:
                 break
         in_order = np.empty_like(costs)
-        in_order[order] = costs
-        return Solution(choices, values, in_order)
+        in_order[known.order] = np.minimum(costs, self.lost)
+        in_order[replaced] = np.inf
+        return Solution(values, walks, in_order, episode, np.minimum(episode_costs, self.lost))
 
-    def _as_linear(self, choices: Choices, n_vertices: int) -> tuple[np.ndarray, csr_array]:
-        """Return what each choice costs by itself, and the probabilities of where it ends.
-
-        Runs that end where they began are repeated: what is returned is of the run that gets somewhere.
-        """
-        failure = 1.0 - choices.success
-        steps = choices.success * choices.steps + failure * timeout(choices.steps)
-        shares = failure[:, None] * choices.share
-        stays = choices.landing == choices.source[:, None]
-        goes = np.maximum(1.0 - (shares * stays).sum(axis=1), 1e-9)
-        shares = np.where(stays, 0.0, shares)
-        ends = np.concatenate([choices.target[:, None], choices.landing], axis=1) % n_vertices
-        probabilities = np.concatenate([choices.success[:, None], shares], axis=1) / goes[:, None]
-        # Sparse: most choices end in two or three vertices.
-        rows, columns = np.nonzero(probabilities)
-        entries = probabilities[rows, columns], (rows, ends[rows, columns])
-        return steps / goes, csr_array(entries, shape=(len(steps), n_vertices))
+    def _worked_out(self, stance: float) -> Known:
+        """Return what training has shown as it costs; the same until something is learned."""
+        version = self.choice_model.version
+        if stance not in self._known or self._known[stance][0] != version:
+            walks = self.choice_model.walks()
+            order = np.argsort(walks.source, kind="stable")
+            sources, first = np.unique(walks.source[order], return_index=True)
+            linear = Linear.of(walks.take(order), stance, len(self.graph.events) + 3)
+            self._known[stance] = version, Known(order, linear, sources, first)
+        return self._known[stance][1]
 
     # -- what a plan is -----------------------------------------------------------------------------------------------
 
     def path(self, solution: Solution, first: int) -> list[int]:
-        """Follow a plan: the choices from the start to the goal, along the likeliest landing of lower value.
+        """Follow a plan: the targets of its options from the start to the goal, along the likeliest landing of lower value.
 
         :param solution: of the goal
-        :param first: the choice at the start
-        :return: row numbers of choices; no vertex comes twice
+        :param first: the row, among those of the episode, of the choice at the start
+        :return: vertices that the options lead to, one for each option; none comes twice
         """
-        choices, values, best = solution.choices, solution.values, solution.best()
-        row, rows = first, [first]
-        value = np.inf  # whatever the first option is: it runs
-        while choices.target[row] != solution.goal:
-            ends = np.append(choices.landing[row], choices.target[row])
-            weight = np.append((1.0 - choices.success[row]) * choices.share[row], choices.success[row])
-            weight[values[ends] >= value] = 0.0
-            weight[ends == NOWHERE] = 0.0
-            if not weight.any():
-                break
-            vertex = int(ends[weight.argmax()])
-            value = values[vertex]
-            row = int(best[vertex])
-            if row < 0 or value >= self.lost:
-                break
-            rows.append(row)
-        return rows
+        values, best, choices = solution.values, solution.best(first), solution.choices
+        targets: list[int] = []
+        vertex, value = solution.start, float(solution.episode_costs[first])
+        while best[vertex] >= 0 and not (targets and values[vertex] >= self.lost):
+            row = choices.take(best[[vertex]])
+            target = int(row.target[0])
+            targets.append(target)
+            if target == solution.goal:
+                return targets
+            landing, share = row.landings()
+            success = row.success(EXPECTED)
+            ends = np.append(landing[0], target)
+            weight = np.append((1.0 - success) * share[0], success)
+            weight[(values[ends] >= value) | (ends == NOWHERE)] = 0.0
+            # An option that runs may be the best no more: then it is where it leads that counts.
+            vertex = int(ends[weight.argmax()]) if weight.any() else target
+            value = min(value, float(values[vertex]))
+        return [*targets, solution.goal]  # nothing leads on from there but to walk to the goal
 
-    def promise(self, start: Start, goal: np.ndarray, runs: Runs, acting: Solution, first: int, remaining: float) -> tuple[float, float]:
+    def promise(self, solution: Solution, first: int, remaining: float) -> tuple[float, float]:
         """Tell what a plan is worth, by what is expected of options rather than what is counted on.
 
-        :param start: where the agent stands
-        :param goal: shape ``(goal_dim,)``
-        :param runs: what has happened in this episode
-        :param acting: the solution that choices are made by
-        :param first: the choice at the start
+        How well options do is not known for sure, and where they do worse than expected they do so again and again, all of
+        them: the walker is then not as good. So the probability is worked out for several opinions of it, from the worst
+        to the best, and averaged.
+
+        :param solution: the solution that choices are made by
+        :param first: the row, among those of the episode, of the choice at the start
         :param remaining: environment steps that are left
         :return: probability that the goal is reached within them, and expected steps if it is
         """
-        expected = self.choice_model.choices(start, goal, runs, Stance.EXPECTED)
-        best = acting.best()
-        best[acting.start] = first
-        policy = expected.take(best[best >= 0])
-        width = remaining / TIME_BINS
-        # reached[t, v]: probability to be at the goal within t bins from v.
-        n = len(acting.values)
-        reached = np.zeros((TIME_BINS + 1, n))
-        reached[:, acting.goal] = 1.0
-        delay = np.concatenate(
-            [policy.steps[:, None], np.repeat(timeout(policy.steps)[:, None], policy.landing.shape[1], axis=1)], axis=1
-        )
-        ends = np.concatenate([policy.target[:, None], policy.landing], axis=1) % n
-        weight = np.concatenate([policy.success[:, None], (1.0 - policy.success)[:, None] * policy.share], axis=1)
-        for t in range(1, TIME_BINS + 1):
-            # In between two bins in proportion; a run takes one at least.
-            at = np.clip(t - np.maximum(delay / width, 1e-3), -1.0, t - 1e-3)
-            low = np.floor(at).astype(np.int64)
-            part = at - low
-            below = np.where(low >= 0, reached[np.maximum(low, 0), ends], 0.0)
-            above = np.where(low + 1 >= 0, reached[np.clip(low + 1, 0, t - 1), ends], 0.0)
-            value = (1.0 - part) * below + part * above
-            reached[t, policy.source] = (weight * value).sum(axis=1)
-        curve = reached[:, acting.start]
+        best = solution.best(first)
+        policy = solution.choices.take(best[best >= 0])
+        policy = policy.take(self._met(policy, solution.start))
+        curve = np.mean([self._arrival(policy, opinion, solution, remaining) for opinion in OPINIONS], axis=0)
         probability = float(curve[-1])
-        steps = float(((np.arange(1, TIME_BINS + 1) - 0.5) * np.diff(curve)).sum() * width / max(probability, 1e-9))
-        return probability, steps
+        steps = float(((np.arange(1, TIME_BINS + 1) - 0.5) * np.diff(curve)).sum() / max(probability, 1e-9))
+        return probability, steps * remaining / TIME_BINS
+
+    @staticmethod
+    def _met(policy: Choices, start: int) -> np.ndarray:
+        """Return the rows of a policy that are met from a start on, however unlikely."""
+        landing, share = policy.landings()
+        ends = np.concatenate([policy.target[:, None], np.where(share > 0.0, landing, NOWHERE)], axis=1)
+        met = policy.source == start
+        while True:
+            more = met | np.isin(policy.source, ends[met])
+            if (more == met).all():
+                return np.flatnonzero(met)
+            met = more
+
+    def _arrival(self, policy: Choices, stance: float, solution: Solution, remaining: float) -> np.ndarray:
+        """Return the probability to have arrived at the goal from the start, within each number of time bins.
+
+        :param policy: the choice at each vertex
+        :param stance: an opinion of how well options do
+        :param solution: says which vertices are goal and start
+        :param remaining: environment steps of all bins together
+        """
+        width, n = remaining / TIME_BINS, len(solution.values)
+        landing, share = policy.landings()
+        success = policy.success(stance)
+        ends = np.concatenate([policy.target[:, None], landing], axis=1) % n
+        share = (1.0 - FOR_GOOD) * share  # the rest is lost
+        weight = np.concatenate([success[:, None], (1.0 - success)[:, None] * share], axis=1)
+        failed = np.repeat(timeout(policy.steps)[:, None], landing.shape[1], axis=1)  # type: ignore[index]
+        # A run takes one bin at least, and otherwise its steps: between two bins it counts for both in proportion.
+        delay = np.maximum(np.concatenate([policy.steps[:, None], failed], axis=1) / width, 1.0)
+        whole = np.floor(delay).astype(np.int64)
+        part = delay - whole
+        # arrived[t, v]: probability to be at the goal within t bins from v; nobody is before the first one.
+        arrived = np.zeros((TIME_BINS + 1, n))
+        arrived[:, solution.goal] = 1.0
+        for t in range(1, TIME_BINS + 1):
+            before, earlier = t - whole, t - whole - 1
+            value = np.where(before >= 0, (1.0 - part) * arrived[before, ends], 0.0)
+            value += np.where(earlier >= 0, part * arrived[earlier, ends], 0.0)
+            arrived[t, policy.source] = (weight * value).sum(axis=1)
+        return arrived[:, solution.start]

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_skillgraph.choices import Runs, Stance, Start
+from sb3_skillgraph.choices import PESSIMISTIC, Runs, Start
 from sb3_skillgraph.graph import NOWHERE, SkillGraph
 from sb3_skillgraph.options.numpy_actor import NumpyActor
 from sb3_skillgraph.options.views import View
@@ -115,7 +115,9 @@ class Runner:
 
     # -- one step -----------------------------------------------------------------------------------------------------
 
-    def advance(self, state: RunnerState, points: np.ndarray, stuck: Sequence[bool] | None = None) -> tuple[RunnerState, list[Run]]:
+    def advance(
+        self, state: RunnerState, points: np.ndarray, stuck: Sequence[bool] | None = None
+    ) -> tuple[RunnerState, list[Run]]:
         """End the options that have reached their termination set, have timed out, or whose agent is stuck.
 
         :param state: the state after the step
@@ -168,7 +170,7 @@ class Runner:
         state.run_count[i, slot] += 1
 
     def act(
-        self, observation: dict[str, np.ndarray], goals: np.ndarray, state: RunnerState, stance: Stance = Stance.PESSIMISTIC
+        self, observation: dict[str, np.ndarray], goals: np.ndarray, state: RunnerState, stance: float = PESSIMISTIC
     ) -> tuple[np.ndarray, RunnerState]:
         """Begin an option where none is running, and let the options act.
 
@@ -195,20 +197,20 @@ class Runner:
         event = self.graph.index(str(state.arrived[i]))
         return Start(point.astype(np.float64), self.graph.locate(point) if event == NOWHERE else event)
 
-    def decide(self, state: RunnerState, i: int, start: Start, goal: np.ndarray, stance: Stance) -> Solution:
+    def decide(self, state: RunnerState, i: int, start: Start, goal: np.ndarray, stance: float) -> Solution:
         """Plan for one environment."""
         return self.planner.solve(start, goal.astype(np.float64), self.runs(state, i), stance)
 
     def begin(self, state: RunnerState, i: int, solution: Solution, start: Start, goal: np.ndarray) -> None:
         """Begin the first option of a plan, in place."""
         first = solution.first()
-        target = int(solution.choices.target[first])
+        target = int(solution.episode.target[first])
         if target == solution.goal:
             state.option[i], state.aim[i] = DIRECT, goal
         else:
             state.option[i], state.aim[i] = self.graph.walk_ids[target], self.graph.centers[target]
         state.began[i] = self.graph.id(start.event)
-        state.steps[i], state.timeout[i] = 0, timeout(float(solution.choices.steps[first]))
+        state.steps[i], state.timeout[i] = 0, timeout(float(solution.episode.steps[first]))
 
     def runs(self, state: RunnerState, i: int) -> Runs:
         """Return the episode's runs of one environment as the planner takes them; those of forgotten events are left out."""

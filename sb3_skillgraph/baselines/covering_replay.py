@@ -5,9 +5,9 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
-from sb3_skillgraph.options.initiation import InitiationSet
-from sb3_skillgraph.memory.replay import OptionReplay
 from sb3_skillgraph.learning.dco import FiedlerEmbedding
+from sb3_skillgraph.memory.replay import OptionReplay
+from sb3_skillgraph.options.initiation import InitiationSet
 
 TERMINATION_SHARE = 0.05  # of the states seen, those with the lowest values are where an option ends
 

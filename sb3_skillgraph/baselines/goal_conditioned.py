@@ -7,8 +7,8 @@ import numpy as np
 from stable_baselines3 import DDPG, HerReplayBuffer
 from stable_baselines3.common.noise import NormalActionNoise
 
-from sb3_skillgraph.options.option import goal_rule
 from sb3_skillgraph.memory.replay import OptionRule
+from sb3_skillgraph.options.option import goal_rule
 
 #: What the agent's own options learn with, for the sake of comparison; the discount is the paper's.
 SETTINGS: dict[str, Any] = dict(

@@ -113,7 +113,9 @@ class HindsightRecipe:
         if begins:  # the way to a goal
             rollout.hold_left[:] = 0
         batch, _ = as_batch(observation, agent.observation_space)
-        scaled = agent.parts.walker.actor.act(agent.parts.runner.view(batch["observation"], batch["achieved_goal"], batch["desired_goal"]))
+        scaled = agent.parts.walker.actor.act(
+            agent.parts.runner.view(batch["observation"], batch["achieved_goal"], batch["desired_goal"])
+        )
         warm_up = agent.parts.store.total < agent.learning_starts
         mission = Mission(batch["desired_goal"][0], exploring=warm_up)
         explored, rollout.held, rollout.hold_left = rollout.with_noise(scaled, [mission], agent.action_noise)

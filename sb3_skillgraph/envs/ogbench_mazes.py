@@ -83,7 +83,9 @@ class OGBenchMazeEnv(GoalTask):
     @property
     def tasks(self) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
         """OGBench's tasks: the centres of the cells of start and goal, each drawn ``TASK_NOISE`` around."""
-        return [(np.array(task["init_xy"], dtype=float), np.array(task["goal_xy"], dtype=float)) for task in self.maze.task_infos]
+        return [
+            (np.array(task["init_xy"], dtype=float), np.array(task["goal_xy"], dtype=float)) for task in self.maze.task_infos
+        ]
 
     # -- what GoalTask asks for ---------------------------------------------------------------------------------------
 

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from stable_baselines3.common.noise import ActionNoise
 
-from sb3_skillgraph.choices import Stance
+from sb3_skillgraph.choices import OPTIMISTIC
 from sb3_skillgraph.learning.missions import Mission, Missions
 from sb3_skillgraph.learning.witness import Witness
 from sb3_skillgraph.memory.replay import TransitionStore
@@ -104,7 +104,7 @@ class Rollout:
         missions = [self.missions.of(i, point, warm_up) for i, point in enumerate(points)]
         state = self._explorers(self.state, missions)
         goals = np.stack([mission.goal for mission in missions])
-        scaled, state = self.runner.act(observation, goals, state, Stance.OPTIMISTIC)
+        scaled, state = self.runner.act(observation, goals, state, OPTIMISTIC)
         scaled, held, hold_left = self.with_noise(scaled, missions, noise)
         self.pending = Step(observation, scaled, state.aim, state, held, hold_left, rng_state)
         return scaled
@@ -152,9 +152,7 @@ class Rollout:
 
     # -- learning -----------------------------------------------------------------------------------------------------
 
-    def observe(
-        self, reached: dict[str, np.ndarray], terminated: np.ndarray, dones: np.ndarray, stuck: np.ndarray
-    ) -> None:
+    def observe(self, reached: dict[str, np.ndarray], terminated: np.ndarray, dones: np.ndarray, stuck: np.ndarray) -> None:
         """Store the step once, and let everything learn from it.
 
         :param reached: the observations that it led to, before any reset, shapes ``(n_envs, dim)``
@@ -190,9 +188,8 @@ class Rollout:
             assert mission is not None
             if run is not None and mission.clean and not mission.random_walk:
                 self.witness.ended(run)
-            if run is not None and not mission.random_walk:
-                if mission.exploring and run.success:
-                    self._salient(point)
+            if run is not None and run.success and mission.exploring and not mission.random_walk:
+                self._salient(point)
             over[i] = self.missions.observe(i, point, run, bool(dones[i]))
             self.n_stuck += bool(stuck[i])
         self.hold_left = np.where(dones, 0, self.hold_left)

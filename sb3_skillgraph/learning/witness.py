@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from sb3_skillgraph.choices import ChoiceModel, Stance
+from sb3_skillgraph.choices import EXPECTED, ChoiceModel
 from sb3_skillgraph.graph import NOWHERE, SkillGraph
 from sb3_skillgraph.planning import DIRECT
 from sb3_skillgraph.runner import Run
@@ -14,8 +14,6 @@ from sb3_skillgraph.walk_model import HASTY_LOSS, Kind
 FIT_EVERY = 1_000
 #: Runs of walks to goals that are remembered for it, where no edge keeps them.
 N_SAMPLES = 1_000
-#: A failed run has landed far away where that is so many times further than it was to go.
-FAR = 2.0
 #: Failures that nothing is known of, in the share that land far away: few say little.
 FAR_PRIOR = 2.0
 #: Columns of the samples: distance (event radii), whether the goal's event was where it began, success, steps.
@@ -86,6 +84,7 @@ class Witness:
         if self._n_steps >= FIT_EVERY:
             self._n_steps = 0
             self.fit()
+            self._bound_degree()
         return is_new
 
     def _pass(self, env: int, point: np.ndarray) -> bool:
@@ -114,15 +113,12 @@ class Witness:
             if stay.event != last.event and stay.event not in seen:
                 seen.add(stay.event)  # only the last time it was passed: a detour is no way
                 self.graph.crossed(stay.event, last.event, max(last.step - stay.step, 1))
-        for event in (*seen, last.event) if seen else ():
-            self._bound_degree(event)
         self._stays[env] = [*recent, last]
 
-    def _bound_degree(self, event: int) -> None:
-        if self.graph.degree(event) > self.graph.max_degree:
-            success = self.choice_model.evidence().success(Stance.EXPECTED)
-            distance = self.choice_model.kinds().distance
-            self.graph.bound_degree(event, success * (1.0 + distance))
+    def _bound_degree(self) -> None:
+        """Keep the walks that are likely to succeed, and of those the long ones: they make ways short."""
+        success = self.choice_model.walks().success(EXPECTED)
+        self.graph.bound_degree(success * (1.0 + self.choice_model.kinds().distance))
 
     def add_event(self, point: np.ndarray, *, salient: bool) -> int:
         """Add an event to the graph, which coarsens its cover where it is full.
@@ -184,15 +180,11 @@ class Witness:
 
     def _learn_loss(self, kinds: Kind) -> None:
         """Learn which share of failures lands far away, for hasty walks and for others."""
-        graph, edges, model = self.graph, self.graph.edges, self.choice_model.model
-        # With one entry more than there are events: NOWHERE is infinitely far away.
-        centers = np.concatenate([graph.centers, np.full((1, graph.goal_dim), np.inf)])
-        away = np.linalg.norm(centers[edges.landing] - graph.centers[edges.source][:, None], axis=2) / graph.radius
-        far = away > FAR * (kinds.distance[:, None] + 1.0)
+        graph, model = self.graph, self.choice_model.model
         hasty = model.is_hasty(kinds)
-        weight = edges.landing_weight * graph.aging()[:, None]
+        failures, far = graph.edges.failures * graph.aging(), self.choice_model.far_failures(kinds)
         for i, (rows, guess) in enumerate(((hasty, HASTY_LOSS), (~hasty, 0.0))):
-            model.loss[i] = ((weight * far)[rows].sum() + FAR_PRIOR * guess) / (weight[rows].sum() + FAR_PRIOR)
+            model.loss[i] = (far[rows].sum() + FAR_PRIOR * guess) / (failures[rows].sum() + FAR_PRIOR)
 
     # -- saving -------------------------------------------------------------------------------------------------------
 

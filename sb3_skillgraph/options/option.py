@@ -8,9 +8,9 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 
 from sb3_skillgraph.events import TerminationSet
+from sb3_skillgraph.memory.replay import OptionReplay, OptionRule
 from sb3_skillgraph.options.initiation import InitiationSet
 from sb3_skillgraph.options.numpy_actor import NumpyActor
-from sb3_skillgraph.memory.replay import OptionReplay, OptionRule
 
 RECORD_LENGTH = 10  # runs that count: an option's policy changes, and old runs speak of an old policy
 EFFECTS_LENGTH = 50

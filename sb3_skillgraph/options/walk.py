@@ -1,6 +1,5 @@
 """Walks: the options that share one goal-conditioned policy, the walker."""
 
-
 import numpy as np
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
@@ -39,4 +38,3 @@ class Walk:
         :return: bool array of shape ``(n,)``
         """
         return self.termination.contains(points)
-

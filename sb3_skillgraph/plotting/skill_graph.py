@@ -11,7 +11,7 @@ from matplotlib.colors import LinearSegmentedColormap, Normalize
 from matplotlib.lines import Line2D
 
 from sb3_skillgraph.agent import SkillGraphAgent
-from sb3_skillgraph.choices import Stance
+from sb3_skillgraph.choices import EXPECTED
 from sb3_skillgraph.envs import MazeGeometry
 from sb3_skillgraph.plotting import figures
 
@@ -43,10 +43,8 @@ def event_links(agent: SkillGraphAgent) -> list[EventLink]:
     :param agent: the agent
     :return: one link for each edge of the graph
     """
-    graph, edges = agent.graph, agent.graph.edges
-    evidence = agent.parts.planner.choice_model.evidence()
-    success = evidence.success(Stance.EXPECTED)
-    columns = (edges.source.tolist(), edges.target.tolist(), success.tolist(), evidence.steps.tolist())
+    graph, walks = agent.graph, agent.parts.planner.choice_model.walks()
+    columns = (walks.source.tolist(), walks.target.tolist(), walks.success(EXPECTED).tolist(), walks.steps.tolist())
     return [EventLink(graph.id(u), graph.id(v), p, steps) for u, v, p, steps in zip(*columns, strict=True)]
 
 
