@@ -54,10 +54,12 @@ class Start(NamedTuple):
 
     :param point: shape ``(goal_dim,)``
     :param event: index of the event that the next option is begun in; ``NOWHERE`` if in none
+    :param towards: vertex that an option leads to which runs already; ``NOWHERE`` if none does
     """
 
     point: np.ndarray
     event: int
+    towards: int = NOWHERE
 
 
 class Choices(NamedTuple):
@@ -124,7 +126,8 @@ class Choices(NamedTuple):
         landings, weights = self.landing[row], self.weight[row]
         known = np.flatnonzero((landings == landing) & (weights > 0.0))
         slot = int(known[0]) if len(known) else int(weights.argmin())
-        landings[slot] = landing
+        if not len(known):
+            landings[slot], weights[slot] = landing, 0.0
         weights[slot] += weight
 
 
@@ -163,28 +166,30 @@ class ChoiceModel:
     def _gather(self) -> Choices:
         edges, aging, kinds = self.graph.edges, self.graph.aging(), self.kinds()
         successes, failures = edges.successes * aging, edges.failures * aging
-        guess = self._with_kin(self.model.success(kinds), successes, successes + failures)
+        hasty = self.model.is_hasty(kinds)
+        guess = self._with_kin(self.model.success(kinds), hasty, successes, successes + failures)
         # A guess of the steps counts for one run.
         steps = (self.model.steps(kinds) + edges.success_steps * aging) / (1.0 + successes)
-        loss = self._with_kin(self._loss(kinds), self.far_failures(kinds), failures)
+        loss = self._with_kin(self._loss(kinds), hasty, self.far_failures(kinds), failures)
         weight = edges.landing_weight * aging[:, None]
         return Choices(edges.source, edges.target, guess, successes, failures, steps, loss, edges.landing, weight)
 
     def _loss(self, kinds: Kind) -> np.ndarray:
         return np.where(self.model.is_hasty(kinds), self.model.loss[0], self.model.loss[1])
 
-    def _with_kin(self, guess: np.ndarray, hits: np.ndarray, runs: np.ndarray) -> np.ndarray:
-        """Return a guessed share, corrected by the runs of other edges out of the same event, and into the same one.
+    def _with_kin(self, guess: np.ndarray, hasty: np.ndarray, hits: np.ndarray, runs: np.ndarray) -> np.ndarray:
+        """Return a guessed share, corrected by the runs of its kin: edges out of the same event, and into the same one.
 
         :param guess: shape ``(n_edges,)``
+        :param hasty: which edges are hasty: those and others are no kin
         :param hits: weight of the runs of each edge of which the share is guessed
         :param runs: weight of all of its runs
         """
         edges, n_events = self.graph.edges, len(self.graph.events)
         total, weight = GUESS_RUNS * guess, np.full(len(guess), GUESS_RUNS)
-        for ends in (edges.source, edges.target):
-            kin_hits = np.bincount(ends, hits, n_events)[ends] - hits
-            kin_runs = np.bincount(ends, runs, n_events)[ends] - runs
+        for ends in (edges.source + n_events * hasty, edges.target + n_events * hasty):
+            kin_hits = np.bincount(ends, hits, 2 * n_events)[ends] - hits
+            kin_runs = np.bincount(ends, runs, 2 * n_events)[ends] - runs
             scale = np.minimum(KINSHIP, MOST_KINSHIP / np.maximum(kin_runs, 1e-9))
             total += scale * kin_hits
             weight += scale * kin_runs
@@ -238,22 +243,30 @@ class ChoiceModel:
     def _to_goal(self, replaced: np.ndarray, tried: Choices, goal: np.ndarray, runs: Runs) -> Choices:
         """Return the walks to the goal itself, from events.
 
-        Where the goal belongs to an event, whoever can walk to that can walk to the goal as well. Otherwise, and from
-        the nearest events anyway, it is a guess.
+        Where the goal belongs to an event, whoever can walk to that can walk to the goal as well. From there itself, and from
+        the events nearest to the goal if they have no such walk, it is a guess.
         """
         graph, vertex = self.graph, len(self.graph.events)
         distance = graph.distances(goal)
         home = graph.locate(goal)
         near = np.argsort(distance, kind="stable")[:NEAR_EVENTS]
-        seen = (near == home).astype(np.float64)  # somebody was near the goal, in its event
-        guessed = self._guessed(near, near, vertex, distance[near], seen, runs)
         if home == NOWHERE:
-            return guessed
-        walks = self._edges(graph.edges.target == home, replaced, tried)
-        # What has been tried in this episode is known better from the guesses.
-        untried = ~np.isin(walks.source, runs.source[runs.target == vertex]) & ~np.isin(walks.source, near)
-        walks = walks.take(untried)
-        between = np.maximum(np.linalg.norm(graph.centers[walks.source] - graph.centers[home], axis=1), 1e-9)
+            return self._guessed(near, near, vertex, distance[near], np.zeros(len(near)), runs)
+        beside = self._beside(self._edges(graph.edges.target == home, replaced, tried), home, distance, runs)
+        near = near[~np.isin(near, beside.source)]
+        seen = (near == home).astype(np.float64)  # somebody was near the goal, in its event
+        return Choices.join([self._guessed(near, near, vertex, distance[near], seen, runs), beside])
+
+    def _beside(self, walks: Choices, home: int, distance: np.ndarray, runs: Runs) -> Choices:
+        """Return walks to the goal for the walks to its event.
+
+        :param walks: to the event
+        :param home: index of the event
+        :param distance: of all events from the goal, in goal units
+        :param runs: of the episode
+        """
+        vertex, centers = len(self.graph.events), self.graph.centers
+        between = np.maximum(np.linalg.norm(centers[walks.source] - centers[home], axis=1), 1e-9)
         stretch = np.clip(distance[walks.source] / between, 0.5, 2.0)
         beside = walks._replace(
             target=np.full(len(walks.target), vertex),
@@ -261,7 +274,10 @@ class ChoiceModel:
             successes=BESIDE * walks.successes,
             steps=stretch * walks.steps,
         )
-        return Choices.join([guessed, beside])
+        for i, source in enumerate(beside.source.tolist()):
+            for success, where, count in runs.of(source, vertex):
+                beside.count(i, success, where, EPISODE_WEIGHT * count)
+        return beside
 
     def _guessed(
         self,
@@ -319,8 +335,11 @@ class ChoiceModel:
             near = np.argsort(distances, kind="stable")[:NEAR_EVENTS]
             nowhere = np.full(len(near), NOWHERE)
             parts.append(self._guessed(near, nowhere, near, distances[near], np.zeros(len(near)), runs))
-        if not any((part.target == n_events).any() for part in parts):
+        targets = np.concatenate([part.target for part in parts])
+        if n_events not in targets:
             distance = np.array([np.linalg.norm(goal - start.point)])
             parts.append(self._guessed(here, event, n_events, distance, np.zeros(1), runs))
+        if start.towards not in (NOWHERE, n_events) and start.towards not in targets:
+            parts.append(self._guessed(here, event, start.towards, distances[[start.towards]], np.ones(1), runs))
         choices = Choices.join(parts)
         return choices._replace(source=np.full(len(choices.source), n_events + 1))

@@ -122,7 +122,7 @@ class SkillGraph:
         self.cover_radius = SPACING * radius
         self.events: list[Event] = []
         self.edges = Edges()
-        self.now = 0.0  # updates of the walker so far: the clock by which records age
+        self._now = 0.0
         self.version = 0  # rises with every change
         self.visits = np.zeros(64)  # of each event
         self._centers = np.zeros((64, goal_dim))
@@ -133,6 +133,16 @@ class SkillGraph:
 
     def __repr__(self) -> str:
         return f"<SkillGraph of {len(self.events)} events and {self.edges.size} edges>"
+
+    @property
+    def now(self) -> float:
+        """Updates of the walker so far: the clock by which records age."""
+        return self._now
+
+    @now.setter
+    def now(self, now: float) -> None:
+        self._now = now
+        self.version += 1
 
     # -- events -------------------------------------------------------------------------------------------------------
 

@@ -181,7 +181,7 @@ def _event_radius(given: float | None, env: VecEnv | None) -> float:
             "event_radius is required: the environment has neither a success_radius nor a distance_threshold to take "
             "it from. Give the distance, in goal units, within which a goal counts as reached."
         )
-    if not (np.isscalar(radius) and 0 < float(radius) < np.inf):  # type: ignore[arg-type]
+    if isinstance(radius, bool) or not isinstance(radius, int | float | np.number) or not 0 < radius < np.inf:
         raise ValueError(f"event_radius must be a positive number, not {radius!r}.")
     return float(radius)
 

@@ -50,24 +50,25 @@ def describe(runner: Runner, state: RunnerState, point: np.ndarray, goal: np.nda
     """
     solution = runner.decide(state, 0, runner.start(state, 0, point), goal, PESSIMISTIC)
     first = _running(runner, state, solution) if state.option[0] else solution.first()
-    targets = runner.planner.path(solution, first)
-    remaining = max(runner.planner.horizon - float(state.elapsed[0]), 1.0)
+    # A running option has taken some of its steps already.
+    remaining = max(runner.planner.horizon - float(state.elapsed[0] - state.steps[0]), 1.0)
     probability, steps = runner.planner.promise(solution, first, remaining)
-    return Plan(_status(runner, goal), _ids(runner, solution, targets), steps, probability)
+    return Plan(_status(runner, goal), _ids(runner, solution, runner.planner.path(solution, first)), steps, probability)
 
 
 def _running(runner: Runner, state: RunnerState, solution: Solution) -> int:
     """Return the choice at the start that stands for the running option."""
     option, episode = str(state.option[0]), solution.episode
     target = solution.goal if option == DIRECT else runner.graph.index(option)
-    rows = np.flatnonzero((episode.source == solution.start) & (episode.target == target))
-    return int(rows[0]) if len(rows) else solution.first()
+    return int(np.flatnonzero((episode.source == solution.start) & (episode.target == target))[0])
 
 
-def _ids(runner: Runner, solution: Solution, targets: list[int]) -> tuple[str, ...]:
-    graph, ids = runner.graph, []
-    for target in targets:
-        ids += [DIRECT, GOAL] if target == solution.goal else [graph.walk_ids[target], graph.events[target].id]
+def _ids(runner: Runner, solution: Solution, path: list[tuple[int, int]]) -> tuple[str, ...]:
+    """Return the ids of the options of a path, and of the events that they are followed to."""
+    graph = runner.graph
+    ids: list[str] = []
+    for target, landing in path:
+        ids += [DIRECT, GOAL] if target == solution.goal else [graph.walk_ids[target], graph.id(landing)]
     return tuple(ids)
 
 

@@ -21,6 +21,8 @@ PRECISION, MAX_SWEEPS = 0.5, 300
 TIME_BINS = 200
 #: Share of the failures that will happen again and again: what a policy without noise cannot do from some place it never can.
 FOR_GOOD = 0.05
+#: Probability that a plan promises at least: nothing is impossible.
+LEAST = 1e-6
 #: Opinions of how well options do, in standard deviations: as far apart as the fifths of a normal distribution.
 OPINIONS = (-1.28, -0.52, 0.0, 0.52, 1.28)
 
@@ -210,31 +212,35 @@ class Planner:
 
     # -- what a plan is -----------------------------------------------------------------------------------------------
 
-    def path(self, solution: Solution, first: int) -> list[int]:
-        """Follow a plan: the targets of its options from the start to the goal, along the likeliest landing of lower value.
+    def path(self, solution: Solution, first: int) -> list[tuple[int, int]]:
+        """Follow a plan from the start to the goal, along the likeliest landing of lower value.
 
         :param solution: of the goal
         :param first: the row, among those of the episode, of the choice at the start
-        :return: vertices that the options lead to, one for each option; none comes twice
+        :return: for each option the vertex that it leads to, and the one that it is followed to; no option comes twice
         """
         values, best, choices = solution.values, solution.best(first), solution.choices
-        targets: list[int] = []
+        steps: list[tuple[int, int]] = []
+        named: set[int] = set()
         vertex, value = solution.start, float(solution.episode_costs[first])
-        while best[vertex] >= 0 and not (targets and values[vertex] >= self.lost):
+        while best[vertex] >= 0 and not (steps and values[vertex] >= self.lost):
             row = choices.take(best[[vertex]])
             target = int(row.target[0])
-            targets.append(target)
+            if target in named:
+                break
+            named.add(target)
             if target == solution.goal:
-                return targets
+                return [*steps, (target, target)]
             landing, share = row.landings()
             success = row.success(EXPECTED)
             ends = np.append(landing[0], target)
             weight = np.append((1.0 - success) * share[0], success)
-            weight[(values[ends] >= value) | (ends == NOWHERE)] = 0.0
+            weight[(values[ends] >= value) | (ends == NOWHERE) | (ends == solution.start)] = 0.0
             # An option that runs may be the best no more: then it is where it leads that counts.
             vertex = int(ends[weight.argmax()]) if weight.any() else target
             value = min(value, float(values[vertex]))
-        return [*targets, solution.goal]  # nothing leads on from there but to walk to the goal
+            steps.append((target, vertex))
+        return [*steps, (solution.goal, solution.goal)]  # nothing leads on from there but to walk to the goal
 
     def promise(self, solution: Solution, first: int, remaining: float) -> tuple[float, float]:
         """Tell what a plan is worth, by what is expected of options rather than what is counted on.
@@ -246,15 +252,17 @@ class Planner:
         :param solution: the solution that choices are made by
         :param first: the row, among those of the episode, of the choice at the start
         :param remaining: environment steps that are left
-        :return: probability that the goal is reached within them, and expected steps if it is
+        :return: probability that the goal is reached within them, and expected steps if it is (what it costs, where that is next to impossible)
         """
         best = solution.best(first)
         policy = solution.choices.take(best[best >= 0])
         policy = policy.take(self._met(policy, solution.start))
         curve = np.mean([self._arrival(policy, opinion, solution, remaining) for opinion in OPINIONS], axis=0)
         probability = float(curve[-1])
-        steps = float(((np.arange(1, TIME_BINS + 1) - 0.5) * np.diff(curve)).sum() / max(probability, 1e-9))
-        return probability, steps * remaining / TIME_BINS
+        if probability < LEAST:
+            return LEAST, float(np.minimum(solution.values[solution.start], self.lost))
+        steps = float(((np.arange(1, TIME_BINS + 1) - 0.5) * np.diff(curve)).sum() / probability)
+        return min(probability, 1.0), steps * remaining / TIME_BINS
 
     @staticmethod
     def _met(policy: Choices, start: int) -> np.ndarray:
@@ -292,7 +300,7 @@ class Planner:
         arrived[:, solution.goal] = 1.0
         for t in range(1, TIME_BINS + 1):
             before, earlier = t - whole, t - whole - 1
-            value = np.where(before >= 0, (1.0 - part) * arrived[before, ends], 0.0)
-            value += np.where(earlier >= 0, part * arrived[earlier, ends], 0.0)
+            value = np.where(before >= 0, (1.0 - part) * arrived[np.maximum(before, 0), ends], 0.0)
+            value += np.where(earlier >= 0, part * arrived[np.maximum(earlier, 0), ends], 0.0)
             arrived[t, policy.source] = (weight * value).sum(axis=1)
         return arrived[:, solution.start]

@@ -116,7 +116,7 @@ class Runner:
     # -- one step -----------------------------------------------------------------------------------------------------
 
     def advance(
-        self, state: RunnerState, points: np.ndarray, stuck: Sequence[bool] | None = None
+        self, state: RunnerState, points: np.ndarray, stuck: Sequence[bool] | np.ndarray | None = None
     ) -> tuple[RunnerState, list[Run]]:
         """End the options that have reached their termination set, have timed out, or whose agent is stuck.
 
@@ -193,9 +193,16 @@ class Runner:
     # -- choosing an option -------------------------------------------------------------------------------------------
 
     def start(self, state: RunnerState, i: int, point: np.ndarray) -> Start:
-        """Return where the next option of an environment begins: in the event arrived at, or the one it belongs to."""
-        event = self.graph.index(str(state.arrived[i]))
-        return Start(point.astype(np.float64), self.graph.locate(point) if event == NOWHERE else event)
+        """Return where the plan of an environment begins.
+
+        That is where the running option began; if none runs, the event arrived at, else the one the agent stands in.
+        """
+        graph, option = self.graph, str(state.option[i])
+        if option:
+            towards = len(graph.events) if option == DIRECT else graph.index(option)
+            return Start(point.astype(np.float64), graph.index(str(state.began[i])), towards)
+        event = graph.index(str(state.arrived[i]))
+        return Start(point.astype(np.float64), graph.locate(point) if event == NOWHERE else event)
 
     def decide(self, state: RunnerState, i: int, start: Start, goal: np.ndarray, stance: float) -> Solution:
         """Plan for one environment."""

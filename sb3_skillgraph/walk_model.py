@@ -1,5 +1,6 @@
 """What is expected of a walk that has not been tried: what walks of its kind have done."""
 
+import copy
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -130,7 +131,7 @@ class WalkModel:
         reached = (successes > 0.0) & (kind.steps > 0.0)
         if not reached.any():
             return
-        taken, distance = success_steps[reached] / successes[reached], kind.distance[reached]
+        taken, distance = success_steps[reached] / successes[reached], np.maximum(kind.distance[reached], 1e-3)
         self.steps_per_radius = float(success_steps[reached].sum() / (successes[reached] * distance).sum())
         self.fastest = float(np.quantile(taken / distance, FASTEST))
         root = np.sqrt(successes[reached])
@@ -141,11 +142,11 @@ class WalkModel:
 
     def get_state(self) -> dict[str, Any]:
         """Return the coefficients as plain data."""
-        return dict(vars(self))
+        return copy.deepcopy(vars(self))
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Restore what :meth:`get_state` returned."""
-        vars(self).update(state)
+        vars(self).update(copy.deepcopy(state))
 
 
 def _pace_features(kind: Kind) -> np.ndarray:

@@ -65,10 +65,8 @@ class OGBenchMazeEnv(GoalTask):
         self.render_mode = render_mode
         self.action_space = self.maze.action_space
         self._init_task(self._geometry(), success_radius or self.maze._goal_tol, max_steps, terminate_on_success)
-        shape = self.maze.observation_space.shape[0] - self._skip
-        number = dict(low=-np.inf, high=np.inf, dtype=np.float64)
-        position = spaces.Box(shape=(2,), **number)  # type: ignore[arg-type]
-        body = spaces.Box(shape=(shape,), **number)  # type: ignore[arg-type]
+        n_numbers = self.maze.observation_space.shape[0] - self._skip
+        position, body = (spaces.Box(-np.inf, np.inf, (n,), np.float64) for n in (2, n_numbers))
         self.observation_space = spaces.Dict({"observation": body, "achieved_goal": position, "desired_goal": position})
         self._place(self.goal)
 

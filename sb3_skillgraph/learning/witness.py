@@ -68,6 +68,8 @@ class Witness:
         :param env: which environment
         :param point: where, shape ``(goal_dim,)``
         """
+        if self._stays[env]:
+            self._left(env)  # where the last one ended
         self._stays[env], self._step[env] = [], 0
         self._pass(env, point)
 
@@ -89,10 +91,10 @@ class Witness:
 
     def _pass(self, env: int, point: np.ndarray) -> bool:
         """Note in which event the trajectory is; a place that belongs to none becomes a landmark."""
-        event = self.graph.locate(point)
-        is_new = event == NOWHERE
-        if is_new:
+        event, is_new = self.graph.locate(point), False
+        if event == NOWHERE:
             event = self.add_event(point, salient=False)
+            is_new = event == len(self.graph.events) - 1
         stays, step = self._stays[env], self._step[env]
         distance = float(np.linalg.norm(self.graph.centers[event] - point))
         if stays and stays[-1].event == event:
