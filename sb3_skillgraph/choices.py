@@ -31,19 +31,19 @@ class Runs(NamedTuple):
     :param target: event that the walk led to; the number of events for the walk to the goal
     :param success: whether they got there
     :param landing: event in which they ended
-    :param count: how many there were of each
+    :param number: how many there were of each
     """
 
     source: np.ndarray
     target: np.ndarray
     success: np.ndarray
     landing: np.ndarray
-    count: np.ndarray
+    number: np.ndarray
 
     def of(self, source: int, target: int) -> list[tuple[bool, int, int]]:
-        """Return success, landing and count of the runs of one option from one event."""
+        """Return success, landing and number of the runs of one option from one event."""
         rows = np.flatnonzero((self.source == source) & (self.target == target))
-        return [(bool(self.success[i]), int(self.landing[i]), int(self.count[i])) for i in rows]
+        return [(bool(self.success[i]), int(self.landing[i]), int(self.number[i])) for i in rows]
 
 
 NO_RUNS = Runs(*np.zeros((5, 0), dtype=np.int64))
@@ -117,7 +117,7 @@ class Choices(NamedTuple):
         """Return the rows of all parts, one after the other."""
         return Choices(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 
-    def count(self, row: int, success: bool, landing: int, weight: float) -> None:
+    def add_runs(self, row: int, success: bool, landing: int, weight: float) -> None:
         """Add runs to a row, in place."""
         if success:
             self.successes[row] += weight
@@ -231,8 +231,8 @@ class ChoiceModel:
         replaced = np.unique(np.array([row for row in found if row is not None], dtype=np.int64))
         tried = self.walks().take(replaced)
         for i, (source, target) in enumerate(zip(tried.source.tolist(), tried.target.tolist(), strict=True)):
-            for success, landing, count in runs.of(source, target):
-                tried.count(i, success, landing, EPISODE_WEIGHT * count)
+            for success, landing, number in runs.of(source, target):
+                tried.add_runs(i, success, landing, EPISODE_WEIGHT * number)
         return replaced, tried
 
     def _edges(self, chosen: np.ndarray, replaced: np.ndarray, tried: Choices) -> Choices:
@@ -275,8 +275,8 @@ class ChoiceModel:
             steps=stretch * walks.steps,
         )
         for i, source in enumerate(beside.source.tolist()):
-            for success, where, count in runs.of(source, vertex):
-                beside.count(i, success, where, EPISODE_WEIGHT * count)
+            for success, where, number in runs.of(source, vertex):
+                beside.add_runs(i, success, where, EPISODE_WEIGHT * number)
         return beside
 
     def _guessed(
@@ -313,8 +313,8 @@ class ChoiceModel:
             np.zeros(landing.shape),
         )
         for i, (begin, end) in enumerate(zip(event.tolist(), targets.tolist(), strict=True)):
-            for success, where, count in runs.of(begin, end):
-                guessed.count(i, success, where, EPISODE_WEIGHT * count)
+            for success, where, number in runs.of(begin, end):
+                guessed.add_runs(i, success, where, EPISODE_WEIGHT * number)
         return guessed
 
     def _at_start(

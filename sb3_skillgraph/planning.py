@@ -252,7 +252,8 @@ class Planner:
         :param solution: the solution that choices are made by
         :param first: the row, among those of the episode, of the choice at the start
         :param remaining: environment steps that are left
-        :return: probability that the goal is reached within them, and expected steps if it is (what it costs, where that is next to impossible)
+        :return: probability that the goal is reached within them, and expected steps if it is (the plan's cost, where that is
+            next to impossible)
         """
         best = solution.best(first)
         policy = solution.choices.take(best[best >= 0])

@@ -19,7 +19,7 @@ from stable_baselines3.common import noise
 
 from sb3_skillgraph.version import __version__
 
-SCHEMA = 1
+SCHEMA = 2
 PathOrFile = str | pathlib.Path | io.BufferedIOBase | BinaryIO
 
 _CLASSES: dict[str, type] = {
@@ -167,7 +167,7 @@ def load_tree(path: PathOrFile, kind: str, suffix: str = ".zip") -> dict[str, An
     :param suffix: file name ending
     :return: the data
     :raises FileNotFoundError: if there is no such file
-    :raises ValueError: if the file is damaged, of another kind, or of a newer schema
+    :raises ValueError: if the file is damaged, of another kind, or of another schema
     """
     if isinstance(path, str | pathlib.Path):
         given = pathlib.Path(path)
@@ -195,6 +195,11 @@ def _read(archive: zipfile.ZipFile, kind: str) -> dict[str, Any]:
         raise ValueError(
             f"it was written by sb3_skillgraph {document['version']} in schema {document['schema']}, newer than the "
             f"schema {SCHEMA} that this version ({__version__}) reads: upgrade sb3_skillgraph"
+        )
+    if document["schema"] < SCHEMA:
+        raise ValueError(
+            f"it was written by sb3_skillgraph {document['version']} in schema {document['schema']}, and this version "
+            f"({__version__}) reads schema {SCHEMA} only: load it with that version, or train anew"
         )
     if document["kind"] != kind:
         raise ValueError(f"it holds a {document['kind']!r}, not a {kind!r}")

@@ -1,18 +1,21 @@
 """Bad input gets one clear error and loses nothing."""
 
+import copy
 import io
+import json
 import os
 import pickle
 import resource
 import signal
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch as th
 from conftest import (
     TOY,
     Faulty,
@@ -28,7 +31,6 @@ from conftest import (
 )
 from gymnasium import spaces
 from stable_baselines3 import DDPG
-from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_skillgraph import OptionEnv, SkillGraphAgent
@@ -87,29 +89,66 @@ def test_environment_that_does_not_fit(env: Callable[[], gym.Env], message: str)
         SkillGraphAgent("MultiInputPolicy", env())
 
 
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        dict(replay_buffer_class=ReplayBuffer),
-        dict(replay_buffer_kwargs=dict(n_sampled_goal=4)),
-        dict(optimize_memory_usage=True),
-        dict(n_steps=3),
-        dict(use_sde=True),
-        dict(salience="curiosity"),
-        dict(salience=None),
-        dict(option_view="sideways"),
-        dict(event_radius=0.0),
-        dict(event_radius=-1.0),
-        dict(event_radius=float("nan")),
-        dict(goal_tolerance=0.0),
-        dict(goal_tolerance=1.5),
-        dict(learning_rate=lambda progress: 1e-3 * progress),
-    ],
-    ids=lambda arguments: next(iter(arguments)),
-)
+OUT_OF_RANGE: list[dict[str, Any]] = [
+    dict(salience="curiosity"),
+    dict(salience=None),
+    dict(option_view="sideways"),
+    dict(option_class="PPO"),
+    dict(option_class=dict),
+    dict(event_radius=0.0),
+    dict(event_radius=-1.0),
+    dict(event_radius=float("nan")),
+    dict(goal_tolerance=0.0),
+    dict(goal_tolerance=1.5),
+    dict(learning_rate=lambda progress: 1e-3 * progress),
+    dict(learning_rate=-1.0),
+    dict(learning_starts=-1),
+    dict(buffer_size=0),
+    dict(batch_size=0),
+    dict(batch_size="many"),
+    dict(batch_size=True),
+    dict(tau=float("nan")),
+    dict(tau=1.5),
+    dict(gamma=1.01),
+    dict(gradient_steps=-2),
+    dict(action_noise=-0.1),
+    dict(max_events=7),
+    dict(walk_steps=0),
+    dict(exploration_steps=0),
+    dict(explore_beyond=-1.0),
+    dict(random_action_prob=1.1),
+    dict(random_action_prob=None),
+    dict(hindsight=-0.1),
+    dict(shaping=-1.0),
+]
+
+
+@pytest.mark.parametrize("arguments", OUT_OF_RANGE, ids=lambda arguments: str(*arguments.items()))
 def test_refused_arguments(arguments: dict[str, Any]) -> None:
     name = next(iter(arguments))
     with pytest.raises(ValueError, match=name.replace("_", ".")):
+        new_agent(**arguments)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        dict(batch_size=2.5),
+        dict(buffer_size=1e3),
+        dict(gradient_steps=1.5),
+        dict(train_freq=0),
+        dict(stats_window_size=-3),
+        dict(shaping=float("inf")),
+        dict(explore_beyond=float("inf")),
+        dict(event_radius="wide"),
+        dict(event_radius=True),
+    ],
+    ids=lambda arguments: str(*arguments.items()),
+)
+@pytest.mark.xfail(strict=True, reason="check_numbers lets fractions of steps, infinities and a few arguments through")
+def test_refused_arguments_that_are_no_such_numbers(arguments: dict[str, Any]) -> None:
+    name = next(iter(arguments))
+    with pytest.raises(ValueError, match=name):
         new_agent(**arguments)
 
 
@@ -179,7 +218,7 @@ def test_start_or_goal_that_is_no_place(where: str, value: Any) -> None:
 # -- predict ----------------------------------------------------------------------------------------------------------
 
 
-def test_predict_before_there_is_any_option() -> None:
+def test_predict_before_anything_was_learned() -> None:
     agent = new_agent()
     obs, _ = agent.env.envs[0].reset()
     action, _ = agent.predict(obs)
@@ -203,6 +242,25 @@ def test_observation_of_the_wrong_kind(obs: Any, message: str) -> None:
         new_agent().predict(obs)
 
 
+@pytest.mark.parametrize("goal", [[1.0], [1.0, np.nan], [[1.0, 1.0]], [1.0, 1.0, 1.0], "there", None])
+def test_goal_that_is_no_point(goal: Any) -> None:
+    env = Recorder(gym.make(TOY))
+    agent = new_agent(env)
+    obs, _ = env.reset(seed=0)
+    if goal is not None:  # plan then takes the one that is observed
+        with pytest.raises(ValueError, match="A goal must be a finite vector"):
+            agent.plan(obs, goal=goal)
+        with pytest.raises(ValueError, match="A goal must be a finite vector"):
+            agent.adapt(np.zeros(2), start=goal)
+    with pytest.raises(ValueError, match="A goal must be a finite vector"):
+        agent.adapt(goal)
+    assert agent.num_timesteps == len(env.transitions) == 0
+    # Nothing of it is left: the agent learns as ever.
+    assert agent.learn(50).num_timesteps == 50
+    assert agent.parts.missions.pinned is None
+    assert agent.episodes.reset_options == {}
+
+
 # -- observations that are no numbers ---------------------------------------------------------------------------------
 
 
@@ -213,10 +271,10 @@ def check_goes_on(agent: SkillGraphAgent, recorders: list[Recorder], reset_num_t
     loaded = SkillGraphAgent.load(file, env=new_vec_env(n_envs=agent.n_envs))
     loaded.load_replay_buffer(replay_file)
     for each in (loaded, agent):
-        total, n_steps = each.store.total, each.num_timesteps * (not reset_num_timesteps)
+        total, n_steps = each.parts.store.total, each.num_timesteps * (not reset_num_timesteps)
         each.learn(120, reset_num_timesteps=reset_num_timesteps)
-        assert each.store.total - total == each.num_timesteps - n_steps == 120
-        for name, column in each.store.get_state()["columns"].items():
+        assert each.parts.store.total - total == each.num_timesteps - n_steps == 120
+        for name, column in each.parts.store.get_state()["columns"].items():
             assert np.isfinite(column).all(), name
         assert np.isfinite(np.concatenate([p.detach().ravel() for p in each.policy.parameters()])).all()
     for i, recorder in enumerate(recorders):
@@ -243,7 +301,7 @@ def test_no_number_in_a_step(key: str, value: float, at: int, n_envs: int, reset
     agent = new_agent(env)
     with pytest.raises(ValueError, match=f"'{key}' of environment {n_envs - 1} .* step {at * n_envs}"):
         agent.learn(300)
-    assert agent.store.total == (at - 1) * n_envs
+    assert agent.parts.store.total == (at - 1) * n_envs
     for recorder in recorders:
         del recorder.transitions[-1]  # the step that was refused
     check_goes_on(agent, recorders, reset_num_timesteps)
@@ -256,7 +314,7 @@ def test_no_number_at_the_first_reset(n_envs: int, reset_num_timesteps: bool) ->
     agent = new_agent(env)
     with pytest.raises(ValueError, match=f"'observation' of environment {n_envs - 1} .* step 0"):
         agent.learn(300)
-    assert agent.store.total == 0
+    assert agent.parts.store.total == 0
     check_goes_on(agent, recorders, reset_num_timesteps)
 
 
@@ -363,6 +421,87 @@ def test_newer_schema(trained: SkillGraphAgent, trained_files: tuple[Path, Path]
     refused(trained, with_member(trained_files[0], "agent.json", document), tmp_path, "newer than .* upgrade")
 
 
+def document_of(path: Path) -> dict[str, Any]:
+    with zipfile.ZipFile(path) as archive:
+        return json.loads(archive.read("agent.json"))
+
+
+def with_document(path: Path, document: Any) -> io.BytesIO:
+    return io.BytesIO(with_member(path, "agent.json", json.dumps(document).encode()))
+
+
+def places(tree: Any, depth: int = 4) -> list[tuple[Any, ...]]:
+    """Ways to the entries of a document, the first two of a list."""
+    entries = tree.items() if isinstance(tree, dict) else enumerate(tree[:2]) if isinstance(tree, list) else ()
+    below = [(key, *rest) for key, entry in entries for rest in (places(entry, depth - 1) if depth else [()])]
+    return [(), *below]
+
+
+WRONG: list[Any] = [None, 5, "x", [], {}, 1e30, True, {"__array__": ["<f8", 0, [3]]}, {"__callable__": "os.system"}]
+
+
+def wrong_documents(path: Path, n: int) -> Iterator[tuple[tuple[Any, ...], Any, io.BytesIO]]:
+    """Files that are whole, but hold something else in one place."""
+    rng, document = np.random.default_rng(0), document_of(path)
+    ways = [way for way in places(document) if way]
+    for i in rng.permutation(len(ways) * len(WRONG))[:n]:
+        way, value = ways[i // len(WRONG)], WRONG[i % len(WRONG)]
+        changed = copy.deepcopy(document)
+        entry = changed
+        for key in way[:-1]:
+            entry = entry[key]
+        entry[way[-1]] = value
+        yield way, value, with_document(path, changed)
+
+
+@pytest.mark.xfail(strict=True, reason="load, set_parameters and load_replay_buffer raise whatever wrong entries lead to")
+@pytest.mark.parametrize("what", ["agent", "parameters", "replay"])
+def test_whole_files_that_hold_something_else(trained: SkillGraphAgent, trained_files: tuple[Path, Path], what: str) -> None:
+    load = {"agent": SkillGraphAgent.load, "parameters": trained.set_parameters, "replay": trained.load_replay_buffer}[what]
+    errors = []
+    for way, value, file in wrong_documents(trained_files[what == "replay"], 200):
+        try:
+            load(file)
+        except ValueError:
+            pass
+        except Exception as error:
+            errors.append((way, value, error))
+    assert errors == []
+
+
+@pytest.mark.xfail(strict=True, reason="rows are overwritten before all entries of the file have been looked at")
+def test_a_replay_buffer_that_is_refused_leaves_the_old_one(
+    trained: SkillGraphAgent, trained_files: tuple[Path, Path], tmp_path: Path
+) -> None:
+    document = document_of(trained_files[1])
+    del document["tree"]["n_trajectories"]
+    trained.learn(20, reset_num_timesteps=False)
+    before = state_of(trained)
+    with pytest.raises((ValueError, KeyError), match="n_trajectories"):
+        trained.load_replay_buffer(with_document(trained_files[1], document))
+    assert differences(before, state_of(trained)) == []
+
+
+@pytest.mark.xfail(strict=True, raises=TypeError, reason="the schema is still that of 0.1.0, whose arguments are unknown now")
+def test_a_file_of_the_first_edition(trained_files: tuple[Path, Path]) -> None:
+    document = document_of(trained_files[0])
+    document["version"], document["schema"] = "0.1.0", 1
+    document["tree"]["arguments"]["gestation_period"] = 5
+    with pytest.raises(ValueError, match=r"0\.1\.0"):
+        SkillGraphAgent.load(with_document(trained_files[0], document))
+
+
+@pytest.mark.parametrize("name", ["policy_kwargs", "option_kwargs"])
+@pytest.mark.xfail(strict=True, reason="only arguments that are functions themselves are asked for, not what is in them")
+def test_a_class_that_is_stored_by_its_name_must_be_given_again(tmp_path: Path, name: str) -> None:
+    made = {"policy_kwargs": dict(net_arch=[8], activation_fn=th.nn.Hardswish)}
+    arguments = made if name == "policy_kwargs" else {"option_kwargs": made}
+    new_agent(**arguments).save(tmp_path / "agent")
+    assert isinstance(SkillGraphAgent.load(tmp_path / "agent", **arguments), SkillGraphAgent)
+    with pytest.raises(ValueError, match=name):
+        SkillGraphAgent.load(tmp_path / "agent")
+
+
 def test_missing_file(trained: SkillGraphAgent, tmp_path: Path) -> None:
     for load in (SkillGraphAgent.load, trained.set_parameters, trained.load_replay_buffer):
         with pytest.raises(FileNotFoundError, match="nothing_here"):
@@ -464,7 +603,7 @@ def test_interrupt_in_an_environment(n_envs: int, at: int) -> None:
     agent = new_agent(env)
     with pytest.raises(KeyboardInterrupt):
         agent.learn(300)
-    assert agent.store.total == agent.num_timesteps == (at - 1) * n_envs
+    assert agent.parts.store.total == agent.num_timesteps == (at - 1) * n_envs
     for recorder in recorders:
         del recorder.transitions[at - 1 :]
     check_goes_on(agent, recorders, False)
@@ -481,7 +620,7 @@ def test_interrupt_in_a_callback() -> None:
 
     with pytest.raises(KeyboardInterrupt):
         agent.learn(300, callback=callback)
-    assert agent.store.total == 249
+    assert agent.parts.store.total == 249
     del env.transitions[-1]
     check_goes_on(agent, [env], False)
 
@@ -489,7 +628,7 @@ def test_interrupt_in_a_callback() -> None:
 def test_interrupt_in_an_update(monkeypatch: pytest.MonkeyPatch) -> None:
     env = Recorder(gym.make(TOY))
     agent = new_agent(env)
-    replay, sample = agent.global_option.replay, agent.global_option.replay.sample
+    replay, sample = agent.parts.walker.replay, agent.parts.walker.replay.sample
 
     def interrupted(*arguments: Any, **kwargs: Any) -> Any:
         if agent.num_timesteps == 260:
@@ -500,15 +639,16 @@ def test_interrupt_in_an_update(monkeypatch: pytest.MonkeyPatch) -> None:
         patch.setattr(replay, "sample", interrupted)
         with pytest.raises(KeyboardInterrupt):
             agent.learn(400)
-    assert agent.store.total == agent.num_timesteps == 260
+    assert agent.parts.store.total == agent.num_timesteps == 260
     check_goes_on(agent, [env], False)
 
 
-@pytest.mark.parametrize("where", ["store.add", "visited.record", "curriculum.observe", "curriculum.assign"])
+@pytest.mark.parametrize("where", ["store.add", "witness.step", "runner.advance", "missions.observe", "rollout.begin_episode"])
 def test_ctrl_c_while_a_step_is_being_stored(where: str, monkeypatch: pytest.MonkeyPatch) -> None:
     env = Recorder(gym.make(TOY, max_steps=60))
     agent = new_agent(env, learning_starts=1000)  # updates are no part of storing
-    owner, name = getattr(agent, where.split(".")[0]), where.split(".")[1]
+    part, name = where.split(".")
+    owner = getattr(agent.parts, part)
     method = getattr(owner, name)
 
     def pressed(*arguments: Any, **kwargs: Any) -> Any:
@@ -522,13 +662,14 @@ def test_ctrl_c_while_a_step_is_being_stored(where: str, monkeypatch: pytest.Mon
         with pytest.raises(KeyboardInterrupt):
             agent.learn(300)
     assert signal.getsignal(signal.SIGINT) is handler
-    assert agent.store.total == agent.num_timesteps == 240
+    assert agent.parts.store.total == agent.num_timesteps == 240
     check_store(agent, env.transitions)
     # Nothing was half done: the agent stands where one does that was stopped after that step.
     ours = state_of(agent)
     twin = state_of(new_agent(gym.make(TOY, max_steps=60), learning_starts=1000).learn(240))
     assert differences(twin["replay"], ours["replay"]) == []
-    for part in ("graph", "chaining", "discovery", "visited", "options", "parameters"):
-        assert differences(twin["agent"][part], ours["agent"][part]) == []
+    for name in ("graph", "model", "walker", "parameters"):
+        assert differences(twin["agent"][name], ours["agent"][name]) == []
+    assert differences(twin["agent"]["progress"]["rollout"], ours["agent"]["progress"]["rollout"]) == []
     assert differences(twin["agent"]["progress"]["rng"], ours["agent"]["progress"]["rng"]) == []
     check_goes_on(agent, [env], False)

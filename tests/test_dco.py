@@ -1,14 +1,19 @@
 """Deep covering options: the learned Fiedler vector against the exact one, and the events it proposes."""
 
+from pathlib import Path
+
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from conftest import new_agent
+from conftest import TOY, differences, new_agent
 from scipy.stats import spearmanr
 
+from sb3_skillgraph import SkillGraphAgent
+from sb3_skillgraph.graph import SkillGraph
+from sb3_skillgraph.learning import dco
+from sb3_skillgraph.learning.dco import LEARN_EVERY, DCOSalience, FiedlerEmbedding
 from sb3_skillgraph.memory.replay import TransitionStore
-from sb3_skillgraph.learning.dco import DCOSalience, FiedlerEmbedding
-from sb3_skillgraph.visited import VisitedStates
 
 
 def grid(width: int, height: int, walls: set[tuple[int, int]] = frozenset()) -> tuple[np.ndarray, np.ndarray]:
@@ -57,43 +62,67 @@ def test_it_says_when_it_has_learned_nothing() -> None:
         FiedlerEmbedding()(np.zeros((1, 2)))
 
 
-def corridor(n_steps: int) -> tuple[TransitionStore, VisitedStates]:
-    """A random walk along a corridor from x = 0 to 10."""
-    store, visited, rng = TransitionStore(n_steps, 2, 2, 1), VisitedStates(2, 0.25), np.random.default_rng(0)
+def corridor(n_steps: int) -> tuple[TransitionStore, SkillGraph]:
+    """A random walk along a corridor from x = 0 to 10, and an event at every second unit of it."""
+    store, rng = TransitionStore(2 * n_steps, 2, 2, 1), np.random.default_rng(0)
+    graph = SkillGraph(2, 0.5, max_events=500)
+    for x in range(0, 11, 2):
+        graph.add_event(np.array([x, 0.0]), salient=False)
+    walk_along(store, n_steps, rng)
+    return store, graph
+
+
+def walk_along(store: TransitionStore, n_steps: int, rng: np.random.Generator) -> None:
     x = 5.0
-    for t in range(n_steps):
+    for _ in range(n_steps):
         after = float(np.clip(x + rng.choice([-0.5, 0.5]), 0.0, 10.0))
         here, there = (np.array([[value, 0.0]], dtype=np.float32) for value in (x, after))
         no = np.zeros(1, dtype=bool)
         store.add(here, here, there, there, np.zeros((1, 1), np.float32), here, no, no)
-        visited.record(0, t, there[0], done=False)
         x = after
-    return store, visited
 
 
-def test_it_proposes_the_two_ends_and_waits_for_new_experience() -> None:
-    store, visited = corridor(3_000)
-    salience, rng = DCOSalience(store, visited, reach=20, n_pairs=2_000), np.random.default_rng(0)
-    pair = [salience.propose(rng), salience.propose(rng)]
-    assert salience.propose(rng) is None
-    ends = sorted(float(center[0]) for center in pair if center is not None)
-    assert len(ends) == 2
-    assert ends[0] < 1.0
-    assert ends[1] > 9.0
-    store.add(*(store.column(name, np.array([0])) for name in ("observation", "achieved_goal")), *[np.zeros((1, 2))] * 2,
-              np.zeros((1, 1)), np.zeros((1, 2)), np.zeros(1, bool), np.zeros(1, bool))  # fmt: skip
-    assert salience.propose(rng) is not None
+def test_it_proposes_the_two_ends_and_learns_anew_after_much_experience(monkeypatch: pytest.MonkeyPatch) -> None:
+    store, graph = corridor(3_000)
+    salience, rng = DCOSalience(store, graph, reach=20, n_pairs=2_000), np.random.default_rng(0)
+    learned = []
+    learn = dco.learn_fiedler
+    monkeypatch.setattr(dco, "learn_fiedler", lambda *arguments: learned.append(store.total) or learn(*arguments))
+    proposed = np.array([salience.propose(rng) for _ in range(30)])
+    assert {tuple(point) for point in proposed} == {(0.0, 0.0), (10.0, 0.0)}
+    walk_along(store, LEARN_EVERY - 1, rng)
+    salience.propose(rng)
+    assert learned == [3_000]
+    walk_along(store, 1, rng)
+    salience.propose(rng)
+    assert learned == [3_000, 3_000 + LEARN_EVERY]
+    # Another one that is given its state goes on like it.
+    other = DCOSalience(store, graph, reach=20, n_pairs=2_000)
+    other.set_state(salience.get_state())
+    for seed in range(5):
+        points = [each.propose(np.random.default_rng(seed)) for each in (salience, other)]
+        np.testing.assert_array_equal(*points)
+    assert len(learned) == 2
 
 
 def test_it_proposes_nothing_before_there_is_experience() -> None:
-    assert DCOSalience(TransitionStore(10, 2, 2, 1), VisitedStates(2, 0.25), 20).propose(np.random.default_rng(0)) is None
+    rng = np.random.default_rng(0)
+    store, graph = corridor(10)
+    assert DCOSalience(TransitionStore(10, 2, 2, 1), graph, 20).propose(rng) is None
+    assert DCOSalience(store, SkillGraph(2, 0.5, max_events=500), 20).propose(rng) is None
 
 
-def test_an_agent_finds_events_in_pairs() -> None:
-    agent = new_agent(salience="dco", retry_after=5)
-    agent.learn(1_000)
-    assert agent.discovery.events_per_attempt == 2
-    assert len(agent.events) >= 3
-    centers = np.array([event.center for event in agent.events])
-    nearest = [np.linalg.norm(agent.visited.points - center, axis=1).min() for center in centers[1:]]
-    assert max(nearest) < 1e-6  # all but the start lie on visited states
+def test_an_agent_explores_from_the_ends_of_what_it_knows(tmp_path: Path) -> None:
+    agent = new_agent(salience="dco")
+    agent.learn(800)
+    salience = agent.parts.missions.salience
+    assert isinstance(salience, DCOSalience)
+    ends = np.array(salience.get_state()["ends"])
+    assert ends.shape == (2, 2)
+    assert (np.linalg.norm(agent.graph.centers[:, None] - ends, axis=2).min(axis=0) < 1e-9).all()
+    # The maze is a corridor around a wall: from one end to the other is further than from either to the middle.
+    assert np.linalg.norm(ends[0] - ends[1]) > 1.5
+    agent.save(tmp_path / "agent")
+    loaded = SkillGraphAgent.load(tmp_path / "agent", env=gym.make(TOY)).parts.missions.salience
+    assert isinstance(loaded, DCOSalience)
+    assert differences(salience.get_state(), loaded.get_state()) == []

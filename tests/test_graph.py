@@ -1,380 +1,511 @@
-"""The skill graph on small cases with known answers; its invariants are in ``test_invariants.py``."""
+"""Events, edges and the records of runs: what the skill graph keeps."""
 
 import copy
+import io
+import json
+from typing import Any
+from unittest import mock
 
 import networkx as nx
 import numpy as np
 import pytest
-from builders import PAPER_GRAPH, PLAIN_WEIGHTS, World, event, make_option, put_initiation
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
-from sb3_skillgraph.graph import SkillGraph
-from sb3_skillgraph.options.option import Option
+from sb3_skillgraph import graph as graph_module
+from sb3_skillgraph.events import Event
+from sb3_skillgraph.graph import GROWTH, MAX_LANDINGS, NOWHERE, SPACING, YOUNG, Edges, SkillGraph
 
-E0, E1 = event(0, 0.0, 0.0), event(1, 10.0, 0.0)
+every_time = settings(derandomize=True, deadline=None, max_examples=40, database=None)
 
 
-def two_events(**kwargs: object) -> SkillGraph:
-    graph = SkillGraph(2, **{**PLAIN_WEIGHTS, **kwargs})  # type: ignore[arg-type]
-    graph.add_event(E0)
-    graph.add_event(E1)
+def line(n_events: int, spacing: float = 2.0, **kwargs: Any) -> SkillGraph:
+    """A graph with events of radius 1 on the first axis of the plane."""
+    graph = SkillGraph(2, 1.0, kwargs.get("max_events", 100))
+    for i in range(n_events):
+        graph.add_event(np.array([spacing * i, 0.0]), salient=i in kwargs.get("salient", ()))
     return graph
 
 
-def leads_to_e1(**kwargs: object) -> Option:
-    return make_option("o1", "e1", E1, **({"start": ((0.0, 0.0), 3.0)} | kwargs))  # type: ignore[arg-type]
+def record(graph: SkillGraph, source: int, target: int) -> dict[str, float]:
+    row = graph.edges.find(source, target)
+    assert row is not None
+    columns = ("forward", "backward", "crossing_steps", "successes", "success_steps", "failures")
+    return {name: float(getattr(graph.edges, name)[row]) for name in columns}
 
 
-def known_beside_e0() -> Option:
-    """An option to e1 known to start beside e0 only."""
-    option = leads_to_e1()
+def landings(graph: SkillGraph, source: int, target: int) -> dict[int, float]:
+    row = graph.edges.find(source, target)
+    pairs = zip(graph.edges.landing[row].tolist(), graph.edges.landing_weight[row].tolist(), strict=True)
+    return {landing: weight for landing, weight in pairs if weight > 0.0}
+
+
+def same(a: Any, b: Any) -> bool:
+    """Whether two trees of plain data are equal, bit for bit."""
+    if isinstance(a, dict):
+        return isinstance(b, dict) and list(a) == list(b) and all(same(a[key], b[key]) for key in a)
+    if isinstance(a, list):
+        return isinstance(b, list) and len(a) == len(b) and all(same(x, y) for x, y in zip(a, b, strict=True))
+    if isinstance(a, np.ndarray):
+        return a.dtype == b.dtype and a.shape == b.shape and a.tobytes() == b.tobytes()
+    return bool(a == b)
+
+
+# -- events -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("center", [[np.nan, 0.0], [[0.0, 1.0]], [np.inf]])
+def test_an_event_needs_a_finite_centre(center: list[Any]) -> None:
+    with pytest.raises(ValueError, match="finite centre"):
+        Event("e0", np.array(center), 1.0)
+
+
+@pytest.mark.parametrize("radius", [0.0, -1.0, np.nan])
+def test_an_event_needs_a_positive_radius(radius: float) -> None:
+    with pytest.raises(ValueError, match="positive radius"):
+        Event("e0", np.zeros(2), radius)
+
+
+def test_an_event_tells_of_single_points_what_it_tells_of_many() -> None:
+    event = Event("e0", np.array([1.0, -1.0, 0.5]), 0.7)
+    points = np.random.default_rng(0).normal(event.center, 0.5, (200, 3))
+    inside = event.contains(points)
+    assert 20 < inside.sum() < 180
+    assert inside.tolist() == [event.holds(point) for point in points]
+
+
+def test_an_event_and_the_walk_to_it_have_one_index_and_ids_of_their_own() -> None:
+    graph = line(3)
+    assert [event.id for event in graph.events] == ["e0", "e1", "e2"]
+    assert graph.walk_ids == ["w0", "w1", "w2"]
+    assert graph.index("e1") == graph.index("w1") == 1
+    assert graph.id(1) == "e1"
+    assert graph.id(NOWHERE) == ""
+    assert [graph.index(id) for id in ("", "goal", "direct", "e3", "1")] == [NOWHERE] * 5
+
+
+def test_without_events_every_point_is_nowhere() -> None:
+    assert line(0).locate(np.zeros(2)) == NOWHERE
+
+
+@every_time
+@given(st.integers(0, 10_000), st.integers(1, 150))
+def test_a_point_belongs_to_the_nearest_event_within_the_cover(seed: int, n_events: int) -> None:
+    rng = np.random.default_rng(seed)
+    graph = SkillGraph(2, 0.5, 1000)
+    centers = rng.uniform(-5.0, 5.0, (n_events, 2))
+    for center in centers:
+        graph.add_event(center, salient=False)
+    np.testing.assert_array_equal(graph.centers, centers)
+    for point in rng.uniform(-6.0, 6.0, (20, 2)):
+        distances = np.linalg.norm(centers - point, axis=1)
+        np.testing.assert_allclose(graph.distances(point), distances)
+        expected = int(distances.argmin()) if distances.min() <= SPACING * 0.5 else NOWHERE
+        assert graph.locate(point) == expected
+
+
+def test_an_event_keeps_its_place_when_the_array_it_was_made_from_changes() -> None:
+    graph, center = SkillGraph(2, 1.0, 10), np.zeros(2)
+    graph.add_event(center, salient=False)
+    center += 5.0
+    assert graph.locate(np.zeros(2)) == 0
+    assert graph.events[0].center.tolist() == [0.0, 0.0]
+
+
+# -- crossings --------------------------------------------------------------------------------------------------------
+
+
+def test_a_crossing_makes_an_edge_and_the_way_back_a_guess() -> None:
+    graph = line(2)
+    graph.crossed(0, 1, 12)
+    assert record(graph, 0, 1) == dict(
+        forward=1.0, backward=0.0, crossing_steps=12.0, successes=0.0, success_steps=0.0, failures=0.0
+    )
+    assert record(graph, 1, 0) == dict(
+        forward=0.0, backward=1.0, crossing_steps=12.0, successes=0.0, success_steps=0.0, failures=0.0
+    )
+    assert graph.edges.find(0, 0) is None
+
+
+def test_the_steps_of_a_crossing_are_a_mean_of_each_direction() -> None:
+    graph = line(2)
+    for steps in (10, 20, 30):
+        graph.crossed(0, 1, steps)
+    assert record(graph, 0, 1)["crossing_steps"] == pytest.approx(20.0)
+    assert record(graph, 1, 0)["crossing_steps"] == pytest.approx(20.0)  # as long as nobody went back
+    graph.crossed(1, 0, 5)
+    assert record(graph, 1, 0)["crossing_steps"] == 5.0
+    assert record(graph, 0, 1)["crossing_steps"] == pytest.approx(20.0)
+
+
+def test_the_steps_of_a_crossing_follow_the_walker() -> None:
+    graph = line(2)
+    for steps in [40] * 50 + [10] * 50:
+        graph.crossed(0, 1, steps)
+    assert 10.0 <= record(graph, 0, 1)["crossing_steps"] < 11.0  # the plain mean would be 25
+
+
+# -- runs -------------------------------------------------------------------------------------------------------------
+
+
+def test_runs_count_and_keep_the_steps_of_the_successful_ones() -> None:
+    graph = line(3)
+    graph.crossed(0, 1, 10)
+    graph.ran(0, 1, True, 1, 8)
+    graph.ran(0, 1, True, 1, 12)
+    graph.ran(0, 1, False, 2, 35)
+    graph.ran(0, 1, False, NOWHERE, 35)
+    assert record(graph, 0, 1) == dict(
+        forward=1.0, backward=0.0, crossing_steps=10.0, successes=2.0, success_steps=20.0, failures=2.0
+    )
+    assert landings(graph, 0, 1) == {2: 1.0, NOWHERE: 1.0}
+    assert record(graph, 1, 0)["failures"] == 0.0
+
+
+def test_records_lose_half_their_weight_when_half_of_the_training_is_later() -> None:
+    graph = line(3)
+    graph.now = 1_000.0
+    graph.crossed(0, 1, 10)
+    for landing in (0, 2, 2):
+        graph.ran(0, 1, False, landing, 35)
+    graph.ran(0, 1, True, 1, 10)
+    graph.now = 2.0 * (1_000.0 + YOUNG) - YOUNG
+    assert graph.aging()[graph.edges.find(0, 1)] == pytest.approx(0.5)
+    assert record(graph, 0, 1)["failures"] == 3.0  # weights are as of when they were written
+    graph.ran(0, 1, True, 1, 20)
+    assert record(graph, 0, 1)["failures"] == pytest.approx(1.5)
+    assert record(graph, 0, 1)["successes"] == pytest.approx(1.5)
+    assert record(graph, 0, 1)["success_steps"] == pytest.approx(25.0)
+    assert landings(graph, 0, 1) == {0: pytest.approx(0.5), 2: pytest.approx(1.0)}
+    assert graph.aging()[graph.edges.find(0, 1)] == 1.0
+    assert record(graph, 0, 1)["forward"] == 1.0  # what was crossed was crossed
+
+
+@every_time
+@given(st.lists(st.tuples(st.floats(0.0, 2_000.0), st.booleans()), min_size=1, max_size=12), st.floats(0.0, 5_000.0))
+def test_a_record_weighs_what_its_runs_weigh_each_by_its_age(runs: list[tuple[float, bool]], later: float) -> None:
+    graph = line(2)
+    graph.crossed(0, 1, 10)
+    written = []
+    for wait, success in runs:
+        graph.now += wait
+        graph.ran(0, 1, success, 0, 10)
+        written.append((graph.now, success))
+    graph.now += later
+    weights = [((time + YOUNG) / (graph.now + YOUNG), success) for time, success in written]
+    row, aging = graph.edges.find(0, 1), graph.aging()
+    assert graph.edges.successes[row] * aging[row] == pytest.approx(sum(w for w, success in weights if success))
+    assert graph.edges.failures[row] * aging[row] == pytest.approx(sum(w for w, success in weights if not success))
+
+
+def test_of_many_landings_the_most_frequent_are_told_apart() -> None:
+    graph = line(20)
+    graph.crossed(0, 1, 10)
+    for landing in [5] * 6 + [6] * 5 + [7] * 4 + list(range(8, 20)):
+        graph.ran(0, 1, False, landing, 35)
+    told = landings(graph, 0, 1)
+    assert len(told) == MAX_LANDINGS
+    assert {5: 6.0, 6: 5.0, 7: 4.0}.items() <= told.items()
+    assert record(graph, 0, 1)["failures"] == 27.0
+
+
+def test_nowhere_is_a_landing_like_others() -> None:
+    graph = line(2)
+    graph.crossed(0, 1, 10)
     for _ in range(3):
-        option.succeeded(np.linspace([2.0, 0.0], [9.0, 0.0], 12), np.array([10.0, 0.0]))
-    option.initiation.refit(force=True)
-    return option
+        graph.ran(0, 1, False, NOWHERE, 35)
+    assert landings(graph, 0, 1) == {NOWHERE: 3.0}
 
 
-def ran(graph: SkillGraph, option: Option, success: bool, end: tuple[float, float] = (10.0, 0.0)) -> None:
-    if success:
-        option.succeeded(np.zeros((3, 2)), np.array(end))
-    else:
-        option.failed(np.zeros(2))
-    graph.refresh(option, refitted=False)
+def test_edges_survive_growing_past_their_first_room() -> None:
+    edges = Edges()
+    pairs = [(i, j) for i in range(15) for j in range(15) if i != j]
+    for k, (i, j) in enumerate(pairs):
+        row = edges.add(i, j, float(k))
+        assert row == k
+        edges.forward[row] = k
+    assert edges.size == len(pairs) == 210
+    assert [(int(i), int(j)) for i, j in zip(edges.source, edges.target, strict=True)] == pairs
+    assert edges.forward.tolist() == edges.updated.tolist() == list(range(210))
+    assert (edges.landing == NOWHERE).all()
+    assert edges.add(3, 4, 9.0) == pairs.index((3, 4))
+    assert edges.size == 210
+    with pytest.raises(AttributeError):
+        edges.no_such_column  # noqa: B018
 
 
-def test_vertices_carry_their_items() -> None:
-    graph = two_events()
-    option = leads_to_e1()
-    graph.add_option(option)
-    assert list(graph.nx.nodes(data="item")) == [("e0", E0), ("e1", E1), ("o1", option)]
+# -- bounds -----------------------------------------------------------------------------------------------------------
 
 
-def test_no_id_twice_and_no_gestating_option() -> None:
-    graph = two_events()
-    with pytest.raises(ValueError, match="e0"):
-        graph.add_event(event(0, 3.0, 3.0))
-    with pytest.raises(ValueError, match="gestating"):
-        graph.add_option(make_option("o1", "e1", E1))
-    assert list(graph.nx.nodes) == ["e0", "e1"]
+def test_events_let_go_of_the_edges_worth_least_only() -> None:
+    graph = line(12)
+    for i in range(1, 12):
+        graph.crossed(0, i, i)
+        graph.ran(0, i, True, i, i)
+    worth = graph.edges.target.astype(float)
+    with mock.patch.object(graph_module, "MAX_DEGREE", 5):
+        graph.bound_degree(worth)
+    assert graph.edges.target[graph.edges.source == 0].tolist() == [7, 8, 9, 10, 11]
+    for i in range(7, 12):
+        assert record(graph, 0, i)["success_steps"] == record(graph, 0, i)["crossing_steps"] == i
+    assert [graph.edges.find(0, i) for i in range(1, 7)] == [None] * 6
+    for i in range(1, 12):  # the others have one edge each
+        row = graph.edges.find(i, 0)
+        assert (graph.edges.source[row], graph.edges.target[row], graph.edges.backward[row]) == (i, 0, 1.0)
 
 
-def test_in_the_paper_an_edge_appears_at_the_first_success_and_weighs_one_over_the_rate() -> None:
-    graph = two_events(**PAPER_GRAPH)
-    option = leads_to_e1()
-    graph.add_option(option)
-    assert not graph.nx.has_edge("o1", "e1")
-    ran(graph, option, False)
-    assert not graph.nx.has_edge("o1", "e1")
-    ran(graph, option, True)
-    assert graph.nx.edges["o1", "e1"]["weight"] == 2.0
-    ran(graph, option, True)
-    assert graph.nx.edges["o1", "e1"]["weight"] == 1.0 / (2.0 / 3.0)
-    assert graph.nx.edges["o1", "e1"]["success_rate"] == 2.0 / 3.0
-    for _ in range(30):
-        ran(graph, option, False)
-    assert not graph.nx.has_edge("o1", "e1")  # a rate of zero is no way at all
+def test_of_edges_that_are_worth_the_same_the_oldest_stay() -> None:
+    graph = line(9)
+    for i in (5, 3, 8, 1):
+        graph.crossed(0, i, 10)
+    with mock.patch.object(graph_module, "MAX_DEGREE", 2):
+        graph.bound_degree(np.ones(graph.edges.size))
+    assert graph.edges.target[graph.edges.source == 0].tolist() == [5, 3]
 
 
-def test_by_default_rates_are_smoothed_and_failing_edges_lose_their_plan() -> None:
-    graph = two_events()
-    option = leads_to_e1()
-    graph.add_option(option)
-    assert graph.nx.edges["o1", "e1"]["weight"] == 2.0  # one of two pseudo-counts
-    ran(graph, option, True)
-    assert graph.nx.edges["o1", "e1"]["weight"] == pytest.approx(1.5)
-    for _ in range(12):
-        ran(graph, option, False)
-    assert graph.shortest_path(["o1"], "e1") is None
+def test_an_event_with_few_edges_keeps_them_all() -> None:
+    graph = line(4)
+    for i in range(1, 4):
+        graph.crossed(0, i, 10)
+    version = graph.version
+    graph.bound_degree(np.zeros(graph.edges.size))
+    assert graph.edges.size == 6
+    assert graph.version == version
 
 
-def test_an_event_leads_into_an_option_at_no_cost_but_never_into_one_that_ends_there() -> None:
-    graph = two_events()
-    graph.add_option(leads_to_e1(start=((5.0, 0.0), 20.0), effects=[(10.0, 0.0)], record=[True]))
-    edge = graph.nx.edges["e0", "o1"]
-    assert (edge["weight"], edge["success_rate"]) == (0.0, 1.0)
-    assert not graph.nx.has_edge("e1", "o1")
-    assert not graph.nx.has_edge("o1", "o1")
+def test_events_too_close_together_merge_and_salient_ones_stay() -> None:
+    graph = line(6, spacing=1.6, salient=(1, 4))
+    new_index = graph.coarsen()
+    assert graph.cover_radius == pytest.approx(GROWTH * SPACING)
+    assert [event.id for event in graph.events] == ["e1", "e4"]
+    assert graph.walk_ids == ["w1", "w4"]
+    assert new_index.tolist() == [0, 0, 0, 1, 1, 1]
+    assert (graph.index("e4"), graph.index("w4"), graph.index("e0"), graph.index("w0")) == (1, 1, NOWHERE, NOWHERE)
+    np.testing.assert_array_equal(graph.centers, [[1.6, 0.0], [6.4, 0.0]])
 
 
-@pytest.mark.parametrize(("containment", "outside", "joined"), [(1.0, 1, False), (0.9, 1, True), (0.9, 2, False)])
-def test_an_event_leads_into_an_option_while_its_triggers_lie_inside(containment: float, outside: int, joined: bool) -> None:
-    graph = two_events(containment=containment, evidence_edges=False)
-    graph.add_option(leads_to_e1(start=((-0.5, 0.0), 1.0)))
-    for _ in range(10):
-        graph.triggered(E0, np.array([-0.9, 0.0]))
-    assert graph.nx.has_edge("e0", "o1")
-    for _ in range(outside):
-        graph.triggered(E0, np.array([0.9, 0.0]))
-    assert graph.nx.has_edge("e0", "o1") == joined
+def test_records_of_merged_events_become_one() -> None:
+    graph = line(6, spacing=1.6, salient=(1, 4))
+    graph.crossed(0, 1, 3)  # within one event from now on
+    graph.crossed(0, 3, 10)
+    graph.crossed(2, 4, 20)
+    graph.crossed(2, 4, 20)
+    graph.ran(0, 3, True, 3, 9)
+    graph.ran(2, 4, False, 5, 35)
+    graph.ran(2, 4, False, NOWHERE, 35)
+    graph.ran(2, 4, False, 1, 35)
+    graph.now = YOUNG
+    graph.coarsen()
+    assert graph.edges.size == 2
+    merged = record(graph, 0, 1)
+    assert merged["forward"] == 3.0
+    assert merged["crossing_steps"] == pytest.approx(50 / 3)
+    assert merged["successes"] == pytest.approx(0.5)  # half a training ago
+    assert merged["success_steps"] == pytest.approx(4.5)
+    assert merged["failures"] == pytest.approx(1.5)
+    assert landings(graph, 0, 1) == {1: pytest.approx(0.5), NOWHERE: pytest.approx(0.5), 0: pytest.approx(0.5)}
+    assert record(graph, 1, 0)["backward"] == 3.0
+    assert graph.aging().tolist() == [1.0, 1.0]
 
 
-def test_by_default_rates_begin_high_and_failures_are_dear() -> None:
-    graph = SkillGraph(2)
-    graph.add_event(E0)
-    graph.add_event(E1)
-    graph.add_option(make_option("o1", "e1", E1, start=((0.0, 0.0), 2.0)))
-    assert graph.nx.edges["o1", "e1"]["success_rate"] == pytest.approx(0.95)
-    assert graph.nx.edges["o1", "e1"]["weight"] == pytest.approx(1 + 5 / 19)  # a nineteenth of a failure before a success
-    for _ in range(4):
-        ran(graph, graph.options["o1"], False)
-    assert graph.nx.edges["o1", "e1"]["success_rate"] == pytest.approx(1.9 / 6)
-    ran(graph, graph.options["o1"], False)
-    assert not graph.nx.has_edge("o1", "e1")
+@every_time
+@given(st.integers(0, 10_000), st.integers(2, 60))
+def test_what_is_left_after_merging_lies_apart_and_everyone_goes_to_the_nearest(seed: int, n_events: int) -> None:
+    rng = np.random.default_rng(seed)
+    graph = SkillGraph(2, 1.0, 100)
+    for center in rng.uniform(0.0, 8.0, (n_events, 2)):
+        i = graph.add_event(center, salient=bool(rng.random() < 0.2))
+        graph.visits[i] = rng.integers(1, 9)
+    centers, total = graph.centers.copy(), graph.visits[:n_events].sum()
+    new_index = graph.coarsen()
+    between = np.linalg.norm(graph.centers[:, None] - graph.centers, axis=2)
+    np.fill_diagonal(between, np.inf)
+    assert between.min() >= graph.cover_radius
+    assert new_index.shape == (n_events,)
+    distances = np.linalg.norm(centers[:, None] - graph.centers, axis=2)
+    np.testing.assert_array_equal(new_index, distances.argmin(axis=1))
+    assert distances.min(axis=1).max() < graph.cover_radius  # nobody ends up nowhere
+    assert graph.visits[: len(graph.events)].sum() == total
+    assert not graph.visits[len(graph.events) :].any()
 
 
-def test_an_option_leads_into_another_while_its_effects_lie_inside() -> None:
-    graph = two_events(**PAPER_GRAPH)
-    first = leads_to_e1(effects=[(10.0, 0.0)] * 9, record=[True] * 9 + [False])
-    second = make_option("o2", "e0", E0, start=((10.0, 0.0), 0.5), record=[True])
-    graph.add_option(first)
-    graph.add_option(second)
-    assert graph.nx.edges["o1", "o2"]["weight"] == 1.0 / 0.9
-    ran(graph, first, True, end=(10.7, 0.0))
-    assert not graph.nx.has_edge("o1", "o2")  # section 3.2.6: one sample outside deletes the edge
-    put_initiation(second.initiation, (10.0, 0.0), 1.5)
-    graph.refresh(second, refitted=True)
-    assert graph.nx.has_edge("o1", "o2")
+# -- any history ------------------------------------------------------------------------------------------------------
+
+operations = st.lists(
+    st.tuples(
+        st.sampled_from(["event", "cross", "cross", "run", "run", "wait", "bound", "coarsen"]),
+        st.integers(0, 50),
+        st.integers(0, 50),
+        st.booleans(),
+    ),
+    max_size=60,
+)
 
 
-def test_shares_of_effects_count_against_the_rate() -> None:
-    graph = two_events(rate_prior=(0.0, 0.0))
-    first = leads_to_e1(effects=[(10.0, 0.0)] * 19 + [(10.7, 0.0)], record=[True] * 10)
-    graph.add_option(make_option("o2", "e0", E0, start=((10.0, 0.0), 0.5), record=[True]))
-    graph.add_option(first)
-    assert graph.nx.edges["o1", "o2"]["weight"] == pytest.approx(1 / 0.95)
+class History:
+    """Applies operations to a graph; events are picked by number, wrapped around."""
+
+    def __init__(self) -> None:
+        self.graph = line(4)
+        self.ids = {event.id for event in self.graph.events}
+
+    def apply(self, kind: str, i: int, j: int, flag: bool) -> None:
+        graph = self.graph
+        source, target = i % len(graph.events), j % len(graph.events)
+        if kind == "event":
+            made = graph.add_event(np.array([0.7 * i, 0.9 * j]), salient=flag)
+            assert graph.events[made].id not in self.ids
+            self.ids.add(graph.events[made].id)
+        elif kind == "cross" and source != target:
+            graph.crossed(source, target, 1 + (i + j) % 40)
+        elif kind == "run" and graph.edges.find(source, target) is not None:
+            landing = target if flag else (i * j) % (len(graph.events) + 1) - 1
+            graph.ran(source, target, flag, landing, 1 + i)
+        elif kind == "wait":
+            graph.now += 50.0 * i
+        elif kind == "bound":
+            with mock.patch.object(graph_module, "MAX_DEGREE", 3):
+                graph.bound_degree(graph.edges.successes + graph.edges.forward)
+            assert np.bincount(graph.edges.source, minlength=1).max() <= 3
+        elif kind == "coarsen" and i < 10:
+            graph.coarsen()
 
 
-def test_an_option_leads_to_another_event_that_holds_its_effects() -> None:
-    graph = two_events(rate_prior=(0.0, 0.0))
-    graph.add_event(event(2, 10.5, 0.0))
-    option = leads_to_e1(effects=[(10.2, 0.0)] * 4, record=[True, False])
-    graph.add_option(option)
-    assert graph.nx.edges["o1", "e2"]["weight"] == 2.0
-    ran(graph, option, True, end=(9.1, 0.0))
-    assert not graph.nx.has_edge("o1", "e2")
-    assert graph.nx.has_edge("o1", "e1")
+def check(graph: SkillGraph) -> None:
+    edges, n = graph.edges, len(graph.events)
+    pairs = list(zip(edges.source.tolist(), edges.target.tolist(), strict=True))
+    assert len(set(pairs)) == edges.size
+    assert [edges.find(*pair) for pair in pairs] == list(range(edges.size))
+    for source, target in pairs:
+        assert source != target
+        assert 0 <= source < n
+        assert 0 <= target < n
+    assert (edges.forward + edges.backward > 0).all()
+    assert (edges.crossing_steps >= 1).all()
+    for column in (edges.successes, edges.success_steps, edges.failures, edges.landing_weight):
+        assert np.isfinite(column).all()
+        assert (column >= 0).all()
+    assert (edges.landing_weight.sum(axis=1) <= edges.failures + 1e-9).all()
+    assert ((edges.landing >= NOWHERE) & (edges.landing < n)).all()
+    assert (edges.updated <= graph.now).all()
+    for i, (event, walk) in enumerate(zip(graph.events, graph.walk_ids, strict=True)):
+        assert graph.index(event.id) == graph.index(walk) == i
+        assert event.id[1:] == walk[1:]
+        np.testing.assert_array_equal(event.center, graph.centers[i])
 
 
-def test_strict_containment_holds_between_an_option_and_the_one_it_chains_to() -> None:
-    """Section 3.2.6: once a parent's set has shrunk away from where its child ends, the edge is deleted."""
-    graph = two_events(**PAPER_GRAPH)
-    parent = make_option("o1", "e1", E1, start=((8.0, 0.0), 2.0), effects=[(10.0, 0.0)], record=[True])
-    child = make_option("o2", "o1", parent, start=((0.0, 0.0), 3.0), effects=[(7.5, 0.0)], record=[True])
-    graph.add_option(parent)
-    graph.add_option(child)
-    assert graph.nx.has_edge("o2", "o1")
-    put_initiation(parent.initiation, (9.5, 0.0), 0.5)
-    graph.refresh(parent, refitted=True)
-    graph.refresh(child, refitted=False)
-    assert not graph.nx.has_edge("o2", "o1")
+@every_time
+@given(operations)
+def test_every_history_leaves_a_sound_graph_that_goes_on_as_its_copy_does(history: list[tuple[str, int, int, bool]]) -> None:
+    applied = History()
+    half = len(history) // 2
+    for operation in history[:half]:
+        applied.apply(*operation)
+        check(applied.graph)
+    restored = History()
+    restored.graph = SkillGraph(2, 1.0, 100)
+    restored.graph.set_state(copy.deepcopy(applied.graph.get_state()))
+    restored.ids = set(applied.ids)
+    assert same(restored.graph.get_state(), applied.graph.get_state())
+    for operation in history[half:]:
+        applied.apply(*operation)
+        restored.apply(*operation)
+    check(restored.graph)
+    assert same(restored.graph.get_state(), applied.graph.get_state())
 
 
-def test_evidence_makes_an_edge_where_containment_does_not() -> None:
-    """Runs from one side of an event that succeed put the whole event into the set: it is contained from then on."""
-    for evidence_edges in (True, False):
-        graph = two_events(evidence_edges=evidence_edges)
-        for x in (-0.9, 0.9):
-            graph.triggered(E0, np.array([x, 0.0]))
-        option = known_beside_e0()
-        graph.add_option(option)
-        assert not graph.nx.has_edge("e0", "o1")
-        graph.ran_from(E0, option, True)
-        graph.refresh(option, refitted=True)
-        assert graph.nx.has_edge("e0", "o1") == evidence_edges
-        assert option.initiation.optimistic(E0.outline()).all() == evidence_edges
-    assert not option.initiation.optimistic(np.array([[-8.0, 0.0]]))[0]  # and no more than that
+def test_a_state_is_no_view_of_the_graph() -> None:
+    graph = line(2)
+    graph.crossed(0, 1, 10)
+    state = graph.get_state()
+    before = copy.deepcopy(state)
+    graph.crossed(0, 1, 20)
+    graph.ran(0, 1, False, 0, 9)
+    graph.visits[0] += 1
+    graph.add_event(np.ones(2) * 9, salient=True)
+    assert same(state, before)
 
 
-def test_an_edge_from_evidence_weighs_nothing_and_its_rate_is_the_share_inside() -> None:
-    graph = two_events()
-    option = known_beside_e0()
-    graph.add_option(option)
-    graph.ran_from(E0, option, True)
-    graph.refresh(option, refitted=True)
-    assert graph.nx.edges["e0", "o1"]["weight"] == 0.0
-    assert graph.nx.edges["e0", "o1"]["success_rate"] == 1.0
+def test_ids_of_merged_events_are_not_given_again() -> None:
+    graph = line(5, spacing=0.5)
+    graph.coarsen()
+    assert [event.id for event in graph.events] == ["e0", "e4"]
+    graph.add_event(np.array([50.0, 0.0]), salient=False)
+    assert graph.events[-1].id == "e5"
+    restored = SkillGraph(2, 1.0, 100)
+    restored.set_state(graph.get_state())
+    restored.add_event(np.array([60.0, 0.0]), salient=False)
+    assert restored.events[-1].id == "e6"
+    assert restored.walk_ids == ["w0", "w4", "w5", "w6"]
 
 
-def test_evidence_holds_at_once_for_every_question() -> None:
-    """Edges, plans and the batched sets follow the option's own set as soon as the run has been told of."""
-    graph = two_events()
-    option = known_beside_e0()
-    graph.add_option(option)
-    side = np.array([-0.6, 0.0])
-    assert graph.startable(side) == []
-    graph.ran_from(E0, option, True)
-    graph.refresh(option, refitted=False)
-    assert option.initiation.optimistic(side[None])[0]
-    assert graph.startable(side) == ["o1"]
-    assert graph.shortest_path(["e0"], "e1") is not None
-    for _ in range(3):
-        option.failed(side)
-        graph.ran_from(E0, option, False)
-        graph.refresh(option, refitted=False)
-    assert not option.initiation.optimistic(side[None])[0]
-    assert graph.startable(side) == []
-    assert graph.shortest_path(["e0"], "e1") is None
+def test_the_version_rises_with_every_change() -> None:
+    graph = line(2)
+    versions = [graph.version]
+    changes = [
+        lambda: graph.crossed(0, 1, 10),
+        lambda: graph.ran(0, 1, True, 1, 10),
+        lambda: graph.ran(0, 1, False, 0, 10),
+        lambda: graph.add_event(np.ones(2), salient=False),
+        lambda: graph.coarsen(),
+        lambda: graph.set_state(graph.get_state()),
+    ]
+    for change in changes:
+        change()
+        versions.append(graph.version)
+    assert versions == sorted(set(versions))
 
 
-def test_evidence_counts_while_runs_mostly_succeed() -> None:
-    graph = two_events()
-    option = known_beside_e0()
-    graph.add_option(option)
-    for success, held in ((False, False), (True, True), (False, False), (True, True), (True, True), (False, True)):
-        graph.ran_from(E0, option, success)
-        assert (list(option.initiation.regions) == ["e0"]) == held
-    assert list(graph.evidence["e0", "o1"]) == [False, True, False, True, True, False]
-    for _ in range(20):  # only recent runs count
-        graph.ran_from(E0, option, False)
-    for _ in range(5):
-        graph.ran_from(E0, option, True)
-    assert list(option.initiation.regions) == ["e0"]
+# -- as networkx has it -----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("refitted", [True, False])
-def test_evidence_that_turns_takes_its_edge_away(refitted: bool) -> None:
-    """At once, not only when the option's set is next fitted."""
-    graph = two_events()
-    option = known_beside_e0()
-    graph.ran_from(E0, option, True)
-    graph.add_option(option)
-    assert graph.nx.has_edge("e0", "o1")
-    for _ in range(3):
-        graph.ran_from(E0, option, False)
-        graph.refresh(option, refitted)
-    assert not graph.nx.has_edge("e0", "o1")
+def test_the_networkx_graph_carries_records_and_where_runs_landed() -> None:
+    graph = line(3, salient=(2,))
+    graph.crossed(0, 1, 10)
+    graph.crossed(2, 1, 14)
+    graph.ran(0, 1, True, 1, 8)
+    graph.ran(0, 1, False, 2, 35)
+    graph.ran(2, 1, False, 2, 35)
+    graph.ran(2, 1, False, NOWHERE, 35)
+    drawn = graph.nx
+    assert set(drawn) == {"e0", "e1", "e2", "w0", "w1", "w2"}
+    assert drawn.nodes["e2"] == {"kind": "event", "salient": True, "radius": 1.0, "x0": 4.0, "x1": 0.0}
+    assert drawn.nodes["w2"] == {"kind": "walk", "target": "e2"}
+    assert drawn.edges["e0", "w1"] == {
+        "forward": 1.0, "backward": 0.0, "crossing_steps": 10.0, "successes": 1.0, "success_steps": 8.0, "failures": 1.0
+    }  # fmt: skip
+    assert drawn.edges["w1", "e1"]["rate"] == pytest.approx(0.25)
+    assert drawn.edges["w1", "e2"]["rate"] == pytest.approx(0.5)
+    assert set(drawn.successors("w1")) == {"e1", "e2"}
+    assert set(drawn.successors("w0")) == set()  # nobody has run it
 
 
-def test_the_paper_knows_no_evidence() -> None:
-    graph = two_events(**PAPER_GRAPH)
-    option = known_beside_e0()
-    for _ in range(5):
-        graph.ran_from(E0, option, True)
-    assert option.initiation.regions == {}
-    graph.add_option(option)
-    assert not graph.nx.has_edge("e0", "o1")
+@every_time
+@given(operations)
+def test_the_networkx_graph_can_be_written_whatever_has_happened(history: list[tuple[str, int, int, bool]]) -> None:
+    applied = History()
+    for operation in history:
+        applied.apply(*operation)
+    graph = applied.graph
+    file = io.BytesIO()
+    nx.write_graphml(graph.nx, file)
+    file.seek(0)
+    read = nx.read_graphml(file)
+    assert set(read) == set(graph.nx)
+    assert set(read.edges) == set(graph.nx.edges)
+    assert json.loads(json.dumps(nx.node_link_data(graph.nx, edges="edges")))["directed"]
+    assert sum(graph.nx.nodes[source]["kind"] == "event" for source, _ in graph.nx.edges) == graph.edges.size
+    for walk in graph.walk_ids:
+        rates = [edge["rate"] for _, _, edge in graph.nx.out_edges(walk, data=True)]
+        assert all(rate > 0 for rate in rates)
+        assert sum(rates) <= 1.0 + 1e-9
 
 
-def test_the_cheapest_path_and_its_success_probability() -> None:
-    graph = two_events(**PAPER_GRAPH)
-    graph.add_event(event(2, 20.0, 0.0))
-    graph.add_option(make_option("o1", "e1", E1, start=((0.0, 0.0), 2.0), effects=[(10, 0)], record=[True, True]))
-    graph.add_option(make_option("o2", "e2", event(2, 20.0, 0.0), start=((10.0, 0.0), 2.0), record=[True, False]))
-    graph.add_option(make_option("o3", "e2", event(2, 20.0, 0.0), start=((0.0, 0.0), 2.0), record=[True] + [False] * 3))
-    path = graph.shortest_path(["e0"], "e2")  # 1 + 2 by way of e1, 4 straight
-    assert path is not None
-    assert path.vertices[:2] == ("e0", "o1")
-    assert path.cost == 3.0
-    assert path.success_probability == 0.5
-    straight = graph.shortest_path(["o3"], "e2")
-    assert straight == (("o3", "e2"), 4.0, 0.25)
-    both = graph.shortest_path(["o3", "o1"], "e2")
-    assert both is not None
-    assert both.vertices[0] == "o1"
-    assert graph.shortest_path(["e2"], "e0") is None
-    assert graph.shortest_path([], "e2") is None
-    assert graph.shortest_path(["e0"], "e9") is None
-    assert graph.shortest_path(["e0"], "e0") == (("e0",), 0.0, 1.0)
-
-
-def test_paths_from_several_vertices() -> None:
-    graph = two_events(**PAPER_GRAPH)
-    e2 = event(2, 20.0, 0.0)
-    graph.add_event(e2)
-    graph.add_option(make_option("o1", "e1", E1, start=((0.0, 0.0), 2.0), effects=[(10, 0)], record=[True, True]))
-    graph.add_option(make_option("o2", "e2", e2, start=((10.0, 0.0), 2.0), record=[True, False]))
-    graph.add_option(make_option("o3", "e2", e2, start=((0.0, 0.0), 2.0), record=[True] + [False] * 3))
-    tree = graph.ways_from(["o1", "o3"])
-    assert {id: tree.cost(id) for id in graph.nx if id in tree} == {"o1": 0.0, "o3": 0.0, "e1": 1.0, "o2": 1.0, "e2": 3.0}
-    assert tree.path("e2") == ["o1", "o2", "e2"]
-    assert "e9" not in tree
-    assert graph.ways_from(["o1", "o3"]) is tree  # nothing has changed
-    around = graph.ways_from(["o1", "o3"], avoid=["o2", "o9"])
-    assert {id: around.cost(id) for id in graph.nx if id in around} == {"o1": 0.0, "o3": 0.0, "e1": 1.0, "e2": 4.0}
-    assert around.path("e2") == ["o3", "e2"]
-    for nowhere in (graph.ways_from(["o1"], avoid=["o1"]), graph.ways_from([])):
-        assert not [id for id in graph.nx if id in nowhere]
-    back = graph.ways_to("e2")
-    assert {id: back.cost(id) for id in graph.nx if id in back} == {
-        "o1": 3.0,
-        "o2": 2.0,
-        "o3": 4.0,
-        "e1": 2.0,
-        "e2": 0.0,
-        "e0": 3.0,
-    }
-    assert back.path("e0") == ["e0", "o1", "o2", "e2"]
-    assert graph.nx.has_edge("o1", "o2")  # asking has changed nothing
-    assert graph.shortest_path(["o1"], "e2") is not None
-    assert graph.reachable("e0") == ["e0", "e1", "e2"]
-    assert graph.reachable("e2") == ["e2"]
-
-
-def test_equally_cheap_ways_are_told_apart_by_the_graph_alone() -> None:
-    """The answer depends on the vertices' order, not on that of the edges' making or on how strings hash."""
-    ways = set()
-    for order in (range(1, 10), range(9, 0, -1)):
-        graph = two_events()
-        for k in range(1, 10):
-            graph.add_option(make_option(f"o{k}", "e1", E1, start=((0.0, 0.0), 2.0), effects=[(10, 0)]))
-        for k in order:
-            graph.options[f"o{k}"].record.append(True)
-            graph.refresh(graph.options[f"o{k}"], refitted=False)
-        ways.add(tuple(graph.ways_from(["o3", "o1", "o2"]).path("e1")))
-    assert len(ways) == 1
-
-
-def test_useful_are_the_startable_options_that_do_not_end_at_once() -> None:
-    graph = two_events()
-    graph.add_option(leads_to_e1(start=((5.0, 0.0), 9.0)))
-    graph.add_option(make_option("o2", "e0", E0, start=((5.0, 0.0), 9.0)))
-    assert [graph.useful(np.array([x, 0.0])) for x in (0.0, 5.0, 10.0, 50.0)] == [["o1"], ["o1", "o2"], ["o2"], []]
-    assert graph.startable(np.zeros(2)) == ["o1", "o2"]
-
-
-def test_startable_are_the_options_whose_set_contains_the_point() -> None:
-    graph = two_events()
-    assert graph.startable(np.zeros(2)) == []
-    graph.add_option(leads_to_e1())
-    graph.add_option(make_option("o2", "e0", E0, start=((4.0, 0.0), 2.0)))
-    assert graph.startable(np.array([0.0, 0.0])) == ["o1"]
-    assert graph.startable(np.array([2.5, 0.0])) == ["o1", "o2"]
-    assert graph.startable(np.array([50.0, 0.0])) == []
-
-
-def test_joined_pairs() -> None:
-    world = World()
-    assert world.graph.joined_pairs() == 0.0
-    world.line()
-    assert world.graph.joined_pairs() == 1.0
-    world.graph.remove_options(["o4"])  # back from e1 to e0
-    assert world.graph.joined_pairs() == pytest.approx(4 / 6)
-
-
-def test_a_removed_option_leaves_nothing_behind() -> None:
-    world = World()
-    world.line()
-    option = world.graph.options["o1"]
-    world.graph.ran_from(world.graph.events["e0"], option, True)
-    assert world.planner.path_to(np.zeros(2), "e1") is not None
-    world.graph.remove_options([option.id])
-    assert "o1" not in world.graph.nx
-    assert world.graph.startable(np.zeros(2)) == []
-    assert world.planner.path_to(np.zeros(2), "e1") is None
-    assert not any(key[1] == "o1" for key in world.graph.evidence)
-    world.graph.add_option(option)
-    assert world.planner.path_to(np.zeros(2), "e1") is not None
-
-
-def test_state_round_trip_keeps_how_ties_fall() -> None:
-    graph = two_events()
-    for k in (5, 3, 8):  # three equally good ways
-        graph.add_option(make_option(f"o{k}", "e1", E1, start=((0.0, 0.0), 2.0), effects=[(10, 0)], record=[True]))
-    ran(graph, graph.options["o5"], False)
-    for _ in range(30):
-        ran(graph, graph.options["o5"], False)
-    for _ in range(30):
-        ran(graph, graph.options["o5"], True)  # its edge is now the youngest
-    restored = SkillGraph(2, **PLAIN_WEIGHTS)
-    restored.set_state(copy.deepcopy(graph.get_state()), graph.options)
-    assert restored.shortest_path(["e0"], "e1") == graph.shortest_path(["e0"], "e1")
-    assert nx.utils.graphs_equal(restored.nx.subgraph(graph.options), graph.nx.subgraph(graph.options))
+def test_the_networkx_graph_is_made_anew_only_after_a_change() -> None:
+    graph = line(2)
+    first = graph.nx
+    assert graph.nx is first
+    graph.crossed(0, 1, 10)
+    assert graph.nx is not first
+    assert graph.nx.number_of_edges() == 2
+    assert first.number_of_edges() == 0

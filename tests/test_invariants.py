@@ -1,352 +1,311 @@
-"""What must hold of every skill graph, after any history of runs, refits and triggers."""
+"""What must hold of every agent, however little it has learned: one graph, whose plans are what happens (DESIGN)."""
 
 import copy
-import math
-from collections.abc import Iterable
+import io
+from collections.abc import Iterator
 from typing import Any
 
-import networkx as nx
+import gymnasium as gym
 import numpy as np
 import pytest
-from builders import PAPER_GRAPH, World, event, make_option, profile, put_initiation
-from hypothesis import given
+import torch as th
+from hypothesis import given, settings
 from hypothesis import strategies as st
+from stable_baselines3.common.env_util import make_vec_env
 
-from sb3_skillgraph.graph import SkillGraph
-from sb3_skillgraph.options.option import Option
+from sb3_skillgraph import SkillGraphAgent
+from sb3_skillgraph.plan import Plan
 
-N_EVENTS = 4
-MODES: dict[str, dict[str, Any]] = {
-    "paper": PAPER_GRAPH,
-    "strict": {"containment": 1.0, "evidence_edges": False},
-    "strict with evidence": {"containment": 1.0, "evidence_edges": True},
-    "lenient": {"containment": 0.9, "evidence_edges": False},
-    "default": {},
+TOY, U_MAZE, MEDIUM = "SkillGraph/ToyMaze-v0", "SkillGraph/PointMazeUMaze-v0", "SkillGraph/PointMazeMedium-v0"
+SMALL: dict[str, Any] = dict(policy_kwargs=dict(net_arch=[16, 16]), batch_size=32, learning_starts=200, train_freq=1, seed=0)
+#: Agents of every kind: barely trained, and trained; alone, and in four environments at once.
+AGENTS = {
+    "barely trained": (TOY, 300, 1),
+    "barely trained in four": (TOY, 300, 4),
+    "trained": (TOY, 3_000, 1),
+    "trained in four": (TOY, 3_000, 4),
 }
-every_mode = pytest.mark.parametrize("mode", MODES)
+MUJOCO_AGENTS = {
+    "U-maze, barely trained": (U_MAZE, 300, 1),
+    "U-maze, trained in four": (U_MAZE, 3_000, 4),
+    "Medium, trained": (MEDIUM, 2_000, 1),
+}
+MAX_STEPS = 80  # of an episode on the toy
 
-# -- the rules, written out once more ---------------------------------------------------------------------------------
-
-
-def share_inside(option: Option, points: list[np.ndarray]) -> float:
-    return float(option.initiation.optimistic(np.stack(points)).mean())
-
-
-def plain_rate(option: Option, prior: tuple[float, float]) -> float:
-    n = len(option.record) + prior[0] + prior[1]
-    return (sum(option.record) + prior[0]) / n if n else 0.0
+th.set_num_threads(1)
 
 
-def option_event_rate(graph: SkillGraph, option: Option, id: str) -> float:
-    """The success rate an edge from an option to an event may have; 0 where there must be none."""
-    rate = plain_rate(option, graph.rate_prior)
-    if option.target == id:
-        return rate
-    share = float(graph.events[id].contains(np.stack(option.effects)).mean()) if option.effects else 0.0
-    return rate * share if share >= graph.containment else 0.0
-
-
-def option_option_rate(graph: SkillGraph, first: Option, second: Option) -> float:
-    rate = plain_rate(first, graph.rate_prior)
-    if first.target == second.id:
-        return rate
-    share = share_inside(second, list(first.effects)) if first.effects else 0.0
-    return rate * share if share >= graph.containment and first is not second else 0.0
-
-
-def event_option_rate(graph: SkillGraph, id: str, option: Option) -> float:
-    share = share_inside(option, list(graph.triggers[id]))
-    if option.target == id:
-        return 0.0
-    return share if share >= graph.containment else 0.0
-
-
-def allowed_rate(graph: SkillGraph, source: str, target: str) -> float:
-    if source in graph.events:
-        return event_option_rate(graph, source, graph.options[target]) if target in graph.options else 0.0
-    option = graph.options[source]
-    if target in graph.events:
-        return option_event_rate(graph, option, target)
-    return option_option_rate(graph, option, graph.options[target])
-
-
-def check_edges(graph: SkillGraph) -> None:
-    """Every edge exists by a test in force now, and carries the rate and the weight that follow from it."""
-    assert set(graph.nx) == graph.events.keys() | graph.options.keys()
-    for source, target, edge in graph.nx.edges(data=True):
-        expected = allowed_rate(graph, source, target)
-        assert expected > 0, f"{source} -> {target} exists without reason: {edge}"
-        assert math.isclose(edge["success_rate"], expected), (source, target)
-        assert edge["success_rate"] >= graph.min_success_rate
-        assert np.isfinite(edge["weight"])
-        assert edge["weight"] >= 0
-        failures = 1.0 / edge["success_rate"] - 1.0  # before a success, on average
-        assert edge["weight"] == (0.0 if source in graph.events else 1.0 + graph.failure_cost * failures)
-
-
-def check_regions(graph: SkillGraph, options: Iterable[Option]) -> None:
-    """An option's set counts a whole event while runs begun there mostly succeed; the bank answers as the sets do."""
-    for option in options:
-        proven = {
-            event
-            for (event, id), outcomes in graph.evidence.items()
-            if id == option.id and (sum(outcomes) + 1) / (len(outcomes) + 2) >= 0.5
-        }
-        assert set(option.initiation.regions) == (proven if graph.evidence_edges else set())
-        for id, points in option.initiation.regions.items():
-            np.testing.assert_array_equal(points, graph.events[id].outline())
-    points = np.stack([np.linspace(-3.0, 13.0, 9), np.zeros(9)], axis=1)
-    indices, inside = graph.option_bank.startable(points)
-    by_id = {graph.option_bank.options[i].id: column for i, column in zip(indices, inside.T, strict=True)}
-    for id, option in graph.options.items():
-        np.testing.assert_array_equal(by_id.get(id, np.zeros(9, dtype=bool)), option.initiation.optimistic(points), err_msg=id)
-
-
-def check_paths(graph: SkillGraph) -> None:
-    """Every path returned is one of the graph, the cheapest, and its numbers are those of its edges."""
-    backwards = graph.nx.reverse(copy=True)
-    for target in graph.nx:
-        costs = nx.single_source_dijkstra_path_length(backwards, target, weight="weight")
-        for source in graph.nx:
-            path = graph.shortest_path([source], target)
-            assert (path is not None) == (source in costs)
-            if path is None:
-                continue
-            assert (path.vertices[0], path.vertices[-1]) == (source, target)
-            edges = [graph.nx.edges[edge] for edge in zip(path.vertices[:-1], path.vertices[1:], strict=True)]
-            assert math.isclose(path.cost, sum(edge["weight"] for edge in edges))
-            assert math.isclose(path.cost, costs[source])
-            assert math.isclose(path.success_probability, math.prod(edge["success_rate"] for edge in edges))
-    for sources in (list(graph.nx)[:1], list(graph.options)[:3], []):
-        tree = graph.ways_from(sources)
-        for target in graph.nx:
-            path = graph.shortest_path(sources, target)
-            assert (target in tree) == (path is not None)
-            if path is not None:
-                assert math.isclose(tree.cost(target), path.cost)
-                assert tree.path(target)[0] in sources
-                assert tree.path(target)[-1] == target
-        back = [graph.ways_to(target) for target in sources]
-        for source in graph.nx:
-            for target, tree_to in zip(sources, back, strict=True):
-                path = graph.shortest_path([source], target)
-                assert (source in tree_to) == (path is not None)
-                assert path is None or math.isclose(tree_to.cost(source), path.cost)
-
-
-def check_starts(world: World) -> None:
-    """No option is planned, or chosen, from outside its initiation set."""
-    graph = world.graph
-    for x in np.linspace(-3.0, 11.0, 8):
-        point = np.array([x, 0.0])
-        startable = [id for id, option in graph.options.items() if option.initiation.optimistic(point[None])[0]]
-        assert graph.startable(point) == startable
-        for target in graph.events:
-            path = world.planner.path_to(point, target)
-            useful = [id for id in startable if not graph.options[id].terminates(point)]
-            assert graph.useful(point) == useful
-            assert (path is not None) == any(nx.has_path(graph.nx, id, target) for id in useful)
-            assert path is None or path.vertices[0] in useful
-            for avoid in ([*graph.options][:1], useful[:1], [*graph.options][1:3], useful):
-                check_detour(world, point, target, avoid)
-
-
-def check_detour(world: World, point: np.ndarray, target: str, avoid: list[str]) -> None:
-    """No plan runs through what has failed lately, unless nothing else leads there."""
-    graph = world.graph
-    detour, path = world.planner.path_to(point, target, avoid), world.planner.path_to(point, target)
-    remaining = graph.nx.subgraph(set(graph.nx) - set(avoid))
-    if any(nx.has_path(remaining, id, target) for id in graph.useful(point) if id not in avoid):
-        assert detour is not None
-        assert path is not None
-        assert not set(detour.vertices) & set(avoid)
-        assert nx.is_path(graph.nx, detour.vertices)
-        assert detour.vertices[0] in graph.useful(point)
-        assert detour.cost >= path.cost or math.isclose(detour.cost, path.cost)
-        assert math.isclose(detour.cost, nx.path_weight(graph.nx, detour.vertices, "weight"))
-    else:
-        assert detour == path
-
-
-# -- histories on a line, with discs for initiation sets --------------------------------------------------------------
-
-index = st.integers(0, 7)
-place = st.sampled_from([0.0, 0.8, 1.8, 2.5, 4.0, 5.0, 7.5, 9.0])
-width = st.sampled_from([0.6, 1.5, 3.0, 20.0])
-operations = st.lists(
-    st.one_of(
-        st.tuples(st.just("option"), index, place, width),
-        st.tuples(st.just("chained"), index, place, width),
-        st.tuples(st.just("success"), index, place, st.sampled_from([-0.8, 0.0, 0.8])),
-        st.tuples(st.just("failure"), index, place, st.just(0.0)),
-        st.tuples(st.just("refit"), index, place, width),
-        st.tuples(st.just("trigger"), index, st.sampled_from([-0.9, 0.0, 0.9]), st.just(0.0)),
-        st.tuples(st.just("remove"), index, st.just(0), st.just(0.0)),
-    ),
-    min_size=12,
-    max_size=40,
-)
-
-
-class History:
-    """Applies operations to a world; options and events are picked by number, wrapped around."""
-
-    def __init__(self, mode: str) -> None:
-        self.world = World(**MODES[mode])
-        self.graph = self.world.graph
-        self.n_made = 0
-        for k in range(N_EVENTS):
-            self.world.add_event(2.5 * k, 0.0)
-        for target, x in ((1, 0.0), (2, 2.5), (0, 2.5)):
-            self.apply("option", target, x, 1.5)
-
-    def _option(self, number: int) -> Option | None:
-        options = list(self.graph.options.values())
-        return options[number % len(options)] if options else None
-
-    def apply(self, kind: str, number: int, x: float, extra: float) -> None:
-        if kind == "trigger":
-            target = self.graph.events[f"e{number % N_EVENTS}"]
-            self.graph.triggered(target, target.center + np.array([x, 0.0]))
-            return
-        if kind == "option":
-            target = self.graph.events[f"e{number % N_EVENTS}"]
-            self._add(target.id, target, x, extra)
-            return
-        option = self._option(number)
-        if option is None:
-            return
-        if kind == "chained":
-            self._add(option.id, option, x, extra)
-        elif kind == "refit":
-            put_initiation(option.initiation, (x, 0.0), extra)
-            self.graph.refresh(option, refitted=True)
-        elif kind == "remove":
-            if not any(other.target == option.id for other in self.graph.options.values()):
-                self.graph.remove_options([option.id])
-        else:
-            self._run(option, np.array([x, 0.0]), kind == "success", extra)
-
-    def _add(self, target: str, termination: Any, x: float, radius: float) -> None:
-        self.n_made += 1
-        option = make_option(f"o{self.n_made}", target, termination, start=((x, 0.0), radius))
-        self.world.chaining.options[option.id] = option
-        self.graph.add_option(option)
-
-    def _run(self, option: Option, start: np.ndarray, success: bool, offset: float) -> None:
-        if success:
-            termination = option.termination
-            center = termination.initiation.core if isinstance(termination, Option) else option.subgoal
-            assert center is not None
-            end = center + np.array([offset, 0.0])
-            if not option.terminates(end):
-                end = center
-            option.succeeded(np.stack([start, start]), end)
-        else:
-            option.failed(start)
-        for one in self.graph.events.values():
-            if one.id != option.target and one.contains(start[None])[0]:
-                self.graph.ran_from(one, option, success)
-        self.graph.refresh(option, refitted=False)
-
-
-@every_mode
-@given(operations)
-@profile(25, shrink=False)
-def test_an_edge_exists_only_while_its_test_holds(mode: str, sequence: list[tuple[str, int, float, float]]) -> None:
-    history = History(mode)
-    for operation in sequence:
-        history.apply(*operation)
-        check_edges(history.graph)
-        check_regions(history.graph, history.graph.options.values())
-
-
-@every_mode
-@given(operations)
-@profile(6, shrink=False)
-def test_paths_are_paths_of_the_graph_that_can_be_begun(mode: str, sequence: list[tuple[str, int, float, float]]) -> None:
-    history = History(mode)
-    for k, operation in enumerate(sequence):
-        history.apply(*operation)
-        history.graph.shortest_path(["o1"], "e0")  # what is cached now must not be used later
-        if k == 9:
-            check_paths(history.graph)
-    check_paths(history.graph)
-    check_starts(history.world)
-
-
-@every_mode
-@given(operations, operations)
-@profile(4, shrink=False)
-def test_a_restored_graph_is_the_same_graph(
-    mode: str, before: list[tuple[str, int, float, float]], after: list[tuple[str, int, float, float]]
-) -> None:
-    history, twin = History(mode), History(mode)
-    for operation in before:
-        history.apply(*operation)
-        twin.apply(*operation)
-    graph = twin.graph
-    restored = SkillGraph(
-        2, graph.containment, graph.rate_prior, graph.evidence_edges, graph.min_success_rate, graph.failure_cost
+def train(env_id: str, n_steps: int, n_envs: int, **kwargs: Any) -> SkillGraphAgent:
+    agent = SkillGraphAgent(
+        "MultiInputPolicy", make_vec_env(env_id, n_envs=n_envs, seed=0), **copy.deepcopy({**SMALL, **kwargs})
     )
-    restored.set_state(copy.deepcopy(graph.get_state()), graph.options)
-    twin.world.graph = twin.graph = twin.world.planner.graph = restored
-    for operation in [None, *after]:
-        if operation is not None:
-            history.apply(*operation)
-            twin.apply(*operation)
-        one, other = history.graph, twin.graph
-        assert list(one.nx) == list(other.nx)
-        assert {v: dict(one.nx.succ[v]) for v in one.nx} == {v: dict(other.nx.succ[v]) for v in other.nx}
-        for x in (-1.0, 2.0, 5.0):
-            for target in one.events:
-                point = np.array([x, 0.0])
-                assert history.world.planner.path_to(point, target) == twin.world.planner.path_to(point, target)
+    return agent.learn(n_steps, log_interval=None)
 
 
-# -- histories of chains, with real initiation sets -------------------------------------------------------------------
-
-runs = st.lists(st.tuples(index, st.integers(-2, 22), st.booleans(), st.booleans()), min_size=10, max_size=30)
-
-
-@every_mode
-@given(runs)
-@profile(5, shrink=False)
-def test_chains_keep_the_graph_in_order(mode: str, sequence: list[tuple[int, int, bool, bool]]) -> None:
-    world = World(**MODES[mode])
-    chaining, graph = world.chaining, world.graph
-    for x in (0.0, 5.0, 10.0):
-        world.add_event(x, 0.0)
-    for source, target in (("e0", "e1"), ("e1", "e2"), ("e1", "e0")):
-        chaining.open_chain(graph.events[source], graph.events[target])
-    for number, x, success, own in sequence:
-        options = list(chaining.options.values())
-        option = options[number % len(options)]
-        start = np.array([0.5 * x, 0.0])
-        if success:
-            end = option.subgoal
-            chaining.learn_success(option, np.linspace(start, end, 12), end, own=own)
-            touched = graph.events.get(option.target or "")
-            if touched is not None:
-                graph.triggered(touched, end)
-        else:
-            chaining.learn_failure(option, start)
-        check_edges(graph)
-        check_regions(graph, options)
-        assert set(graph.options) == {id for id, o in chaining.options.items() if o.mature} == set(world.matured)
-        for chain in chaining.chains.values():
-            ways = [chaining.options[id] for id in chain.options]
-            assert all(o.mature for o in ways[:-1])
-            assert [o.target for o in ways] == [chain.target, *chain.options[:-1]]
-            assert not (chain.complete and not ways[0].mature)
-            startable = [way for way in ways if graph.nx.has_edge(chain.source, way.id)]
-            assert not (chain.complete and not startable) or chain is not chaining.chain_of[option.id]
-    check_paths(graph)
-    check_starts(world)
+@pytest.fixture(scope="module")
+def agents() -> dict[str, SkillGraphAgent]:
+    return {name: train(*spec) for name, spec in AGENTS.items()}
 
 
-def test_events_do_not_lead_to_events() -> None:
-    graph = SkillGraph(2)
-    for k in range(3):
-        graph.add_event(event(k, 0.5 * k, 0.0))
-    assert graph.nx.number_of_edges() == 0
+@pytest.fixture(scope="module")
+def mujoco_agents() -> dict[str, SkillGraphAgent]:
+    return {name: train(*spec) for name, spec in MUJOCO_AGENTS.items()}
+
+
+class Moment:
+    """One step of an evaluation: what was seen, what was planned, and what was done."""
+
+    def __init__(
+        self, obs: dict[str, np.ndarray], state: Any, plan: Plan, action: np.ndarray, new_state: Any, option: str
+    ) -> None:
+        self.obs, self.state, self.plan, self.action, self.new_state, self.option = obs, state, plan, action, new_state, option
+
+
+def episode(agent: SkillGraphAgent, env: gym.Env, seed: int) -> Iterator[Moment]:
+    """Run a whole episode, planning at every step."""
+    obs, _ = env.reset(seed=seed)
+    state, over = None, False
+    while not over:
+        plan = agent.plan(obs, state=state)
+        action, new_state = agent.predict(obs, state)
+        assert new_state is not None
+        (option,) = agent.running(new_state)
+        yield Moment(obs, state, plan, action, new_state, option)
+        state = new_state
+        obs, _, terminated, truncated, _ = env.step(action)
+        over = terminated or truncated
+
+
+def check_plan(agent: SkillGraphAgent, moment: Moment, where: str) -> None:
+    """A plan is a path of the graph, begins with the option that runs, and promises something."""
+    path = moment.plan.path
+    where = f"{where}: {moment.plan}, runs {moment.option}"
+    assert moment.option, where
+    assert path[0] == moment.option, where
+    assert path[-2:] == ("direct", "goal"), where
+    assert len(set(path)) == len(path), where
+    graph = agent.graph
+    for option, event in zip(path[:-2:2], path[1:-2:2], strict=True):
+        assert option in graph.walk_ids, where
+        assert graph.index(event) >= 0, where
+    assert 0.0 <= moment.plan.success_probability <= 1.0, where
+    assert 0.0 <= moment.plan.expected_steps < np.inf, where
+    assert moment.plan.status in ("on_graph", "in_initiation", "off_graph")
+
+
+def check_episodes(agent: SkillGraphAgent, env_id: str, seeds: range, max_steps: int) -> int:
+    """Run whole episodes; return in how many steps a plan was followed in which something had already failed."""
+    env, after_failures = gym.make(env_id, max_steps=max_steps), 0
+    for seed in seeds:
+        for k, moment in enumerate(episode(agent, env, seed)):
+            check_plan(agent, moment, f"episode {seed}, step {k}")
+            # As long as there is time there is hope.
+            assert moment.plan.success_probability > 0.0 or k > agent.parts.planner.horizon // 2
+            after_failures += bool(moment.state is not None and (moment.state[-1][0] > 0).any() and not moment.state[-3].all())
+        assert k + 1 == max_steps
+    env.close()
+    return after_failures
+
+
+@pytest.mark.parametrize("name", AGENTS)
+def test_the_plan_is_what_happens_at_every_step(agents: dict[str, SkillGraphAgent], name: str) -> None:
+    assert check_episodes(agents[name], TOY, range(2), MAX_STEPS) > 0
+
+
+@pytest.mark.mujoco
+@pytest.mark.parametrize("name", MUJOCO_AGENTS)
+def test_the_plan_is_what_happens_at_every_step_of_a_simulator(mujoco_agents: dict[str, SkillGraphAgent], name: str) -> None:
+    check_episodes(mujoco_agents[name], MUJOCO_AGENTS[name][0], range(2), 100)
+
+
+@pytest.mark.parametrize("name", AGENTS)
+@settings(derandomize=True, deadline=None, max_examples=40, database=None)
+@given(point=st.tuples(*[st.floats(-4.0, 4.0)] * 2), goal=st.tuples(*[st.floats(-40.0, 40.0)] * 2))
+def test_there_is_a_path_from_anywhere_to_anywhere(
+    agents: dict[str, SkillGraphAgent], name: str, point: tuple[float, float], goal: tuple[float, float]
+) -> None:
+    agent = agents[name]
+    obs = {"observation": np.array(point), "achieved_goal": np.array(point), "desired_goal": np.array(goal)}
+    plan = agent.plan(obs)
+    _, state = agent.predict(obs)
+    assert state is not None
+    assert plan.path[0] == agent.running(state)[0]
+    assert plan.path[-2:] == ("direct", "goal")
+    assert 0.0 <= plan.success_probability <= 1.0
+    assert 0.0 <= plan.expected_steps < np.inf
+    assert str(plan)
+    other = agent.plan({**obs, "desired_goal": np.zeros(2)}, goal=np.array(goal))
+    assert other == plan
+
+
+# -- the graph --------------------------------------------------------------------------------------------------------
+
+
+def check_graph(agent: SkillGraphAgent) -> None:
+    graph, edges = agent.graph, agent.graph.edges
+    assert len(graph.events) > 1
+    assert edges.size > 0
+    assert (edges.forward + edges.backward > 0).all()
+    assert (edges.source != edges.target).all()
+    assert (edges.crossing_steps[edges.forward > 0] <= agent.parts.witness.walk_steps).all()
+    assert (edges.crossing_steps >= 1).all()
+    for column in (edges.successes, edges.failures, edges.success_steps, edges.landing_weight):
+        assert (np.isfinite(column) & (column >= 0)).all()
+    assert (edges.landing_weight.sum(axis=1) <= edges.failures + 1e-6).all()
+    assert [option.id for option in agent.options] == graph.walk_ids
+    assert [option.target for option in agent.options] == [event.id for event in agent.events]
+    walks = agent.parts.planner.choice_model.walks()
+    for stance in (1.0, 0.0, -0.5):
+        rates = walks.success(stance)
+        assert ((rates >= 0) & (rates <= 1)).all()
+    assert (np.isfinite(walks.steps) & (walks.steps >= 1)).all()
+
+
+@pytest.mark.parametrize("name", AGENTS)
+def test_edges_stand_for_crossings_in_one_direction_or_the_other(agents: dict[str, SkillGraphAgent], name: str) -> None:
+    check_graph(agents[name])
+
+
+@pytest.mark.mujoco
+@pytest.mark.parametrize("name", MUJOCO_AGENTS)
+def test_edges_of_a_simulator_stand_for_crossings(mujoco_agents: dict[str, SkillGraphAgent], name: str) -> None:
+    check_graph(mujoco_agents[name])
+
+
+@pytest.mark.parametrize("n_envs", [1, 4])
+def test_the_same_seed_gives_the_same_graph(agents: dict[str, SkillGraphAgent], n_envs: int) -> None:
+    name = "barely trained" if n_envs == 1 else "barely trained in four"
+    again, other = train(*AGENTS[name]), train(*AGENTS[name], seed=1)
+    np.testing.assert_equal(again.graph.get_state(), agents[name].graph.get_state())
+    np.testing.assert_equal(again.parts.model.get_state(), agents[name].parts.model.get_state())
+    assert not np.array_equal(other.graph.centers, again.graph.centers)
+
+
+def test_a_graph_that_is_full_is_still_sound() -> None:
+    agent = train(TOY, 1_500, 2, max_events=8)
+    assert 1 < len(agent.graph.events) <= 8
+    assert agent.graph.cover_radius > 1.5 * agent.event_radius
+    check_graph(agent)
+    env = gym.make(TOY, max_steps=40)
+    for moment in episode(agent, env, 0):
+        assert moment.plan.path[-1] == "goal"
+        assert moment.option
+
+
+# -- the memory -------------------------------------------------------------------------------------------------------
+
+
+class Recorder(gym.Wrapper):
+    """Notes every transition as the environment made it."""
+
+    def __init__(self, env: gym.Env) -> None:
+        super().__init__(env)
+        self.transitions: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+
+    def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
+        self.last, info = self.env.reset(**kwargs)
+        return self.last, info
+
+    def step(self, action: np.ndarray) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        before = self.last["achieved_goal"].copy()
+        self.last, *rest = self.env.step(action)
+        self.transitions.append((before, np.array(action), self.last["achieved_goal"].copy()))
+        return (self.last, *rest)
+
+
+@pytest.mark.parametrize("n_envs", [1, 3])
+def test_each_transition_is_in_the_store_once_and_in_order(n_envs: int) -> None:
+    env = make_vec_env(TOY, n_envs=n_envs, seed=0, wrapper_class=Recorder)
+    agent = SkillGraphAgent("MultiInputPolicy", env, **copy.deepcopy(SMALL)).learn(600, log_interval=None)
+    agent.learn(90, log_interval=None, reset_num_timesteps=False)
+    store = agent.parts.store
+    assert len(store) == store.total == agent.num_timesteps >= 690
+    for i in range(n_envs):
+        transitions = env.env_method("get_wrapper_attr", "transitions", indices=i)[0]
+        rows = np.arange(store.total)[i::n_envs]
+        before, action, after = (np.array(column) for column in zip(*transitions, strict=True))
+        np.testing.assert_allclose(store.column("achieved_goal", rows), before, atol=1e-6)
+        np.testing.assert_allclose(store.column("next_achieved_goal", rows), after, atol=1e-6)
+        np.testing.assert_allclose(agent.parts.unscale(store.column("action", rows)), action, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", AGENTS)
+def test_the_store_holds_as_many_transitions_as_steps_were_taken(agents: dict[str, SkillGraphAgent], name: str) -> None:
+    agent = agents[name]
+    assert len(agent.parts.store) == agent.num_timesteps >= AGENTS[name][1]
+
+
+@pytest.mark.parametrize("name", ["barely trained", "trained in four"])
+def test_removing_the_trajectories_changes_no_action(agents: dict[str, SkillGraphAgent], name: str) -> None:
+    agent, file = agents[name], io.BytesIO()
+    agent.save(file)
+    file.seek(0)
+    loaded = SkillGraphAgent.load(file)
+    assert len(loaded.parts.store) == 0
+    env = gym.make(TOY, max_steps=MAX_STEPS)
+    state = None
+    for moment in episode(agent, env, 0):
+        plan = loaded.plan(moment.obs, state=state)
+        action, state = loaded.predict(moment.obs, state)
+        np.testing.assert_array_equal(action, moment.action)
+        assert state is not None
+        np.testing.assert_equal(tuple(state), tuple(moment.new_state))
+        assert (plan.status, plan.path) == (moment.plan.status, moment.plan.path)
+
+
+# -- predict ----------------------------------------------------------------------------------------------------------
+
+
+def generators(agent: SkillGraphAgent) -> list[Any]:
+    return [agent.parts.rng.bit_generator.state, np.random.get_state(legacy=False), th.get_rng_state().numpy()]  # noqa: NPY002
+
+
+def knowledge(agent: SkillGraphAgent) -> list[Any]:
+    parts, learner = agent.parts, agent.parts.walker.learner
+    networks = {name: tensor.numpy().copy() for name, tensor in learner.policy.state_dict().items()}
+    rollout = parts.rollout.get_state()
+    learned = [parts.graph.get_state(), parts.graph.version, parts.model.get_state(), rollout, parts.store.total, networks]
+    return copy.deepcopy(learned)
+
+
+@pytest.mark.parametrize("name", ["barely trained", "trained"])
+def test_acting_and_planning_touch_no_generator_and_leave_everything_as_it_is(
+    agents: dict[str, SkillGraphAgent], name: str
+) -> None:
+    agent, env = agents[name], gym.make(TOY, max_steps=40)
+    before, known = copy.deepcopy(generators(agent)), knowledge(agent)
+    for moment in episode(agent, env, 3):
+        assert moment.option
+    np.testing.assert_equal(generators(agent), before)
+    np.testing.assert_equal(knowledge(agent), known)
+
+
+def test_predict_is_a_function_of_observation_and_state(agents: dict[str, SkillGraphAgent]) -> None:
+    agent, env = agents["trained"], gym.make(TOY, max_steps=40)
+    moments = list(episode(agent, env, 5))
+    for i in np.random.default_rng(0).permutation(len(moments)).tolist():
+        moment = moments[i]
+        kept = copy.deepcopy((moment.obs, moment.state))
+        action, state = agent.predict(moment.obs, moment.state)
+        np.testing.assert_array_equal(action, moment.action)
+        np.testing.assert_equal(tuple(state or ()), tuple(moment.new_state))
+        np.testing.assert_equal((moment.obs, moment.state), kept)
+        assert agent.plan(moment.obs, state=moment.state) == moment.plan
+
+
+def test_a_batch_acts_as_each_environment_does_alone(agents: dict[str, SkillGraphAgent]) -> None:
+    agent = agents["trained"]
+    envs = [gym.make(TOY, max_steps=200) for _ in range(3)]
+    seen = [env.reset(seed=i)[0] for i, env in enumerate(envs)]
+    together: Any = None
+    alone: list[Any] = [None] * 3
+    for k in range(50):
+        batch = {key: np.stack([obs[key] for obs in seen]) for key in seen[0]}
+        starts = np.array([k == 20, False, k == 33])
+        actions, together = agent.predict(batch, together, episode_start=starts)
+        for i, env in enumerate(envs):
+            action, alone[i] = agent.predict(seen[i], alone[i], episode_start=starts[i : i + 1])
+            np.testing.assert_allclose(actions[i], action, atol=1e-6)
+            np.testing.assert_equal(tuple(column[0] for column in alone[i]), tuple(column[i] for column in together))
+            seen[i] = env.step(action)[0]
+        assert agent.running(together) == [agent.running(state)[0] for state in alone]

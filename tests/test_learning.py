@@ -7,16 +7,17 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from conftest import EAGER, SMALL, TOY, Recorder, check_store, differences, new_agent, new_vec_env
+from builders import make_option, profile
+from conftest import SMALL, TOY, Recorder, check_store, differences, new_agent, new_vec_env
 from gymnasium import spaces
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from stable_baselines3 import DDPG, SAC, TD3
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.type_aliases import TrainFrequencyUnit
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from sb3_skillgraph import PAPER, OptionEnv, SkillGraphAgent
+from sb3_skillgraph import OptionEnv, SkillGraphAgent
 from sb3_skillgraph.envs import MazeMap
 from sb3_skillgraph.evaluation import evaluate_pairs, run_pair
 from sb3_skillgraph.events import Event
@@ -39,36 +40,41 @@ def test_reaches_goals_it_never_trained_on() -> None:
     agent = SkillGraphAgent(
         "MultiInputPolicy", gym.make(TOY), **{**SMALL, "policy_kwargs": dict(net_arch=[32, 32]), "seed": 1}
     )
-    untrained = evaluate_pairs(agent, TOY).success_rate
-    random = evaluate_pairs(RandomWalk(), TOY).success_rate
-    agent.learn(5000, log_interval=None)
-    trained = evaluate_pairs(agent, TOY).success_rate
-    assert trained > max(untrained, random) + 0.2
-    assert trained > 0.6
-    summary = agent.graph_summary()
-    assert summary["coverage"] > 0.7
-    assert summary["joined_pairs"] > 0.3
+    untrained = evaluate_pairs(agent, TOY, n_pairs=40).success_rate
+    random = evaluate_pairs(RandomWalk(), TOY, n_pairs=40).success_rate
+    agent.learn(4000, log_interval=None)
+    trained = evaluate_pairs(agent, TOY, n_pairs=40)
+    assert trained.success_rate > max(untrained, random) + 0.2
+    assert trained.success_rate > 0.6
+    # The graph covers the maze, and its plans are worth what they promise.
+    free = gym.make(TOY).unwrapped.geometry
+    points = np.array([free.sample_free(np.random.default_rng(i)) for i in range(200)])
+    covered = [agent.graph.distances(point).min() <= agent.graph.cover_radius for point in points]
+    assert np.mean(covered) > 0.9
+    assert agent.graph_summary()["tried_edges"] > 3
+    promised = np.mean([promise for promise, _ in trained.promises])
+    assert abs(promised - trained.success_rate) < 0.3
 
 
 @pytest.mark.parametrize("explore_beyond", [0.0, 5.0])
 def test_explorations_go_past_a_random_point(explore_beyond: float) -> None:
-    agent = new_agent(explore_prob=1.0, explore_beyond=explore_beyond)
+    agent = new_agent(explore_beyond=explore_beyond)
     walks, past = 0, []
 
     def note(*_: Any) -> bool:
         nonlocal walks
-        for mission in agent.curriculum.missions:
-            if mission.beyond is None:
-                walks += 1
-            else:
-                past.append(float(np.linalg.norm(mission.beyond - mission.goal)))
+        (mission,) = agent.parts.missions.current
+        if mission.beyond is None:
+            walks += mission.explore_steps > 0
+        else:
+            past.append(float(np.linalg.norm(mission.beyond - mission.goal)))
         return True
 
-    agent.learn(1000, callback=note)
-    reach = explore_beyond * agent.graph.events["e0"].radius
+    agent.learn(1500, callback=note)
+    reach = explore_beyond * agent.event_radius
     assert walks
     assert min(past) >= reach
-    assert len(set(past)) > 3
+    assert len(set(past)) > 2
     assert min(past) < reach + 1.0
 
 
@@ -76,17 +82,17 @@ def test_finds_a_way_to_a_region_that_training_never_reached() -> None:
     """A door opens after training: adaptation looks for a way to the goal behind it, and old goals stay reachable."""
     shut: MazeMap = [[1] * 6, [1, "r", 0, 1, 0, 1], [1, 0, 0, 1, 0, 1], [1, 0, 0, 1, 0, 1], [1] * 6]
     opened: MazeMap = [*shut[:3], [1, 0, 0, 0, 0, 1], shut[4]]  # who walks straight on stands at the wall beside the door
-    arguments = {**SMALL, "policy_kwargs": dict(net_arch=[32, 32]), "event_reach": 15, "seed": 1}
+    arguments = {**SMALL, "policy_kwargs": dict(net_arch=[32, 32]), "learning_rate": 2e-3, "seed": 1}
     agent = SkillGraphAgent("MultiInputPolicy", gym.make(TOY, maze_map=shut), **arguments)
-    agent.learn(3000, log_interval=None)
-    assert agent.visited.points[:, 0].max() < 0.5
+    agent.learn(2500, log_interval=None)
+    assert agent.graph.centers[:, 0].max() < 0.5
     env = gym.make(TOY, maze_map=opened, terminate_on_success=True)
     old, new = np.array([-0.5, -1.0]), np.array([1.5, 1.0])
     before = success_rate(agent, env, new)
     assert before < 0.5
     agent.set_env(new_vec_env(TOY, 1, maze_map=opened))  # seeded
-    agent.adapt(new, total_timesteps=4000)
-    assert success_rate(agent, env, new) > before + 0.4  # so it was with each of 20 seeds
+    agent.adapt(new, total_timesteps=3000)
+    assert success_rate(agent, env, new) > before + 0.4
     assert success_rate(agent, env, old) == 1.0
 
 
@@ -106,43 +112,45 @@ def test_other_option_classes_learn(option_class: type, extra: dict[str, Any]) -
     agent = new_agent(option_class=option_class, learning_starts=100, **extra)
     before = {name: value.clone() for name, value in agent.policy.state_dict().items()}
     agent.learn(500)
-    assert isinstance(agent.global_option.learner, option_class)
-    assert agent.options
-    assert all(isinstance(option.learner, option_class) for option in agent.options)
+    assert isinstance(agent.parts.walker.learner, option_class)
+    assert all(option.learner is agent.parts.walker.learner for option in agent.options)
     after = agent.policy.state_dict()
     assert any(not th.equal(before[name], after[name]) for name in before if "actor" in name)
     assert all(th.isfinite(value).all() for value in after.values())
 
 
+def actions_with(noise: Any, n_envs: int = 1) -> np.ndarray:
+    """What an agent does that acts on without learning, and without random actions once the first walks are over."""
+    agent = new_agent(
+        new_vec_env(n_envs=n_envs), action_noise=noise, random_action_prob=0.0, learning_starts=0, gradient_steps=0
+    )
+    agent.learn(260)
+    return agent.parts.store.get_state()["columns"]["action"]
+
+
 @pytest.mark.parametrize("n_envs", [1, 2])
 @pytest.mark.parametrize("noise_class", [NormalActionNoise, OrnsteinUhlenbeckActionNoise])
 def test_action_noise_is_what_explores(noise_class: type, n_envs: int) -> None:
-    def actions(sigma: float) -> np.ndarray:
-        noise = noise_class(np.zeros(2), sigma * np.ones(2))
-        agent = new_agent(new_vec_env(n_envs=n_envs), action_noise=noise, random_action_prob=0.0, learning_starts=0)
-        agent.learn(260)  # the first hundred steps of each are a random walk
-        return agent.store.get_state()["columns"]["action"]
-
-    assert not np.array_equal(actions(0.5), actions(0.0))
-    assert np.abs(actions(0.5)).max() <= 1.0
-    assert len(actions(0.5)) == 260
+    strong, none = (actions_with(noise_class(np.zeros(2), sigma * np.ones(2)), n_envs) for sigma in (0.5, 0.0))
+    assert not np.array_equal(strong, none)
+    assert np.abs(strong).max() <= 1.0
+    assert len(strong) == 260
 
 
-@pytest.mark.parametrize("n_envs", [1, 2])
-def test_the_paper_as_written(n_envs: int) -> None:
-    arguments = {
-        **PAPER,
-        **EAGER,
-        "policy_kwargs": dict(net_arch=[16, 16]),
-        "salient_event_freq": 2,
-        "retry_after": 1,
-        "seed": 0,
-    }
-    agent = SkillGraphAgent("MultiInputPolicy", new_vec_env(n_envs=n_envs, max_steps=60), **arguments).learn(1500)
+def test_action_noise_may_be_a_number() -> None:
+    strong, weak, none = (actions_with(deviation) for deviation in (0.5, 0.1, 0.0))
+    assert not np.array_equal(strong, weak)
+    assert not np.array_equal(weak, none)
+    np.testing.assert_array_equal(actions_with(0.5), strong)
+
+
+@pytest.mark.skip(reason="PAPER rests until skills are built on the graph of walks")
+def test_the_paper_as_written() -> None:
+    from sb3_skillgraph import PAPER
+
+    agent = new_agent(**PAPER).learn(1500)
     assert len(agent.events) >= 3
-    assert agent.options
-    assert any(option.mature for option in agent.options)
-    assert any(option.learner._n_updates > 0 for option in agent.options)
+    assert any(option.learner is not agent.parts.walker.learner for option in agent.options)
 
 
 @pytest.mark.parametrize(
@@ -151,33 +159,46 @@ def test_the_paper_as_written(n_envs: int) -> None:
         dict(train_freq=(1, "episode"), gradient_steps=-1),
         dict(train_freq=8, gradient_steps=8),
         dict(gradient_steps=0),
-        dict(global_update_fraction=1.0),
-        dict(warm_start=False, global_update_fraction=0.0),
-        dict(shared_experience=0.0, hindsight=0.0),
-        dict(salience="rrt", target_choice="uniform", max_unconnected=None, event_tries=1),
-        dict(nearest="euclidean"),
+        dict(hindsight=0.0),
+        dict(hindsight=1.0, shaping=1.0, goal_tolerance=1.0),
+        dict(salience="rrt", explore_beyond=3.0),
+        dict(max_events=8, walk_steps=5),
         dict(buffer_size=100),
+        dict(option_view="egocentric", event_radius=0.3),
+        dict(random_action_prob=1.0, exploration_steps=1),
     ],
     ids=lambda arguments: next(iter(arguments)),
 )
 def test_arguments_work_together(arguments: dict[str, Any]) -> None:
     agent = new_agent(learning_starts=100, **arguments).learn(450)
     assert agent.num_timesteps >= 450
-    assert agent.store.total == agent.num_timesteps
+    assert agent.parts.store.total == agent.num_timesteps
     per_step = agent.train_freq.unit == TrainFrequencyUnit.STEP
     n_expected = 0 if agent.gradient_steps == 0 else agent.num_timesteps - 100
     assert abs(agent._n_updates - n_expected) <= (8 if per_step else 100)
+    assert len(agent.events) <= agent.graph.max_events
 
 
 def test_salience_may_be_an_object() -> None:
+    corners = [[-1.0, -1.0], [1.0, 1.0], [1.0, -1.0]]
+
     class Corners:
         def propose(self, rng: np.random.Generator) -> np.ndarray:
-            return np.array([[-1.0, -1.0], [1.0, 1.0], [1.0, -1.0]])[rng.integers(3)]
+            return np.array(corners)[rng.integers(3)]
 
-    agent = new_agent(salience=Corners()).learn(600)
-    assert len(agent.events) >= 2
-    for event in agent.events[1:]:
-        assert np.abs(event.center).tolist() == [1.0, 1.0]
+    agent, aims = new_agent(salience=Corners()), set()
+
+    def note(*_: Any) -> bool:
+        (mission,) = agent.parts.missions.current
+        if mission.beyond is not None:
+            aims.add(tuple(mission.beyond))
+        return True
+
+    agent.learn(1500, callback=note)
+    assert aims <= {tuple(corner) for corner in corners}
+    assert len(aims) > 1
+    for event in agent.events:
+        assert not event.salient or np.linalg.norm(event.center - corners, axis=1).min() <= agent.event_radius
 
 
 def test_another_maze_and_another_range_of_actions() -> None:
@@ -235,7 +256,7 @@ def test_goals_of_three_dimensions(tmp_path: Any, extra: bool) -> None:
     agent = new_agent(env).learn(600)
     assert agent.event_radius == 0.3
     assert all(event.center.shape == (3,) for event in agent.events)
-    assert agent.options
+    assert len(agent.options) > 3
     agent.save(tmp_path / "agent")
     loaded = SkillGraphAgent.load(tmp_path / "agent", env=Space(extra))
     obs, _ = env.reset()
@@ -248,7 +269,7 @@ def test_goals_of_three_dimensions(tmp_path: Any, extra: bool) -> None:
 # -- every transition is in the store exactly once --------------------------------------------------------------------
 
 
-@settings(max_examples=8, deadline=None)
+@profile(8)
 @given(
     n_envs=st.integers(1, 3),
     calls=st.lists(st.tuples(st.integers(1, 70), st.booleans(), st.integers(1, 90)), min_size=1, max_size=4),
@@ -266,12 +287,12 @@ def test_every_transition_is_in_the_store_once(n_envs: int, calls: list[tuple[in
             stopped = next(counter) == stop_at
             return not stopped
 
-        n_before = agent.store.total
+        n_before = agent.parts.store.total
         agent.learn(n_steps, callback=callback, reset_num_timesteps=reset_num_timesteps)
         if stopped:
             for recorder in recorders:
                 del recorder.transitions[-1]
-        assert stopped or agent.store.total > n_before or not reset_num_timesteps
+        assert stopped or agent.parts.store.total > n_before or not reset_num_timesteps
         for i, recorder in enumerate(recorders):
             check_store(agent, recorder.transitions, i)
 
@@ -338,9 +359,9 @@ def test_option_env_goes_on_where_the_last_run_ended() -> None:
 @pytest.mark.parametrize("option_class", [OptionDDPG, OptionTD3, TD3, SAC])
 def test_an_option_that_copies_another_goes_on_learning_like_it(option_class: Any) -> None:
     agent = new_agent(option_class=option_class).learn(800)
-    source = agent.global_option
+    source = agent.parts.walker
     assert source.learner.actor.optimizer.state_dict()["state"]
-    twins = [agent._factory.make(id, None, None) for id in ("one", "two")]
+    twins = [agent.parts.factory.make(id, None, None) for id in ("one", "two")]
     for twin in twins:
         copy_policy(source, twin)
     before = [copy.deepcopy(learner.get_parameters()) for learner in (source.learner, twins[1].learner)]
@@ -361,14 +382,24 @@ def test_option_env_is_truncated_with_its_environment() -> None:
     assert ends == [(False, False)] * 49 + [(False, True)]
 
 
-def test_option_env_leads_into_the_initiation_set_of_an_option(trained: SkillGraphAgent) -> None:
-    parent = next(option for option in trained.options if option.mature)
+def test_option_env_leads_into_the_initiation_set_of_an_option() -> None:
+    parent = make_option("o1", "e0", Event("e0", np.array([1.0, 1.0]), 0.45), start=((-0.5, 1.0), 0.4))
     env = OptionEnv(gym.make(TOY), parent, initiation=parent.initiation)
-    inside = parent.initiation.core
-    _, info = env.reset(options={"start": inside})
+    _, info = env.reset(options={"start": parent.initiation.core})
     assert info["can_start"]
     _, reward, terminated, _, info = env.step(np.zeros(2, dtype=np.float32))
     assert (reward, terminated, info["is_success"]) == (0.0, True, True)
+    _, info = env.reset(options={"start": np.array([1.0, 0.0])})
+    assert not info["can_start"]
+
+
+@pytest.mark.xfail(strict=True, raises=AttributeError, reason="walks know neither radius nor centre: OptionEnv takes none yet")
+def test_option_env_takes_a_walk(trained: SkillGraphAgent) -> None:
+    walk = trained.options[0]
+    env = OptionEnv(gym.make(TOY), walk)
+    obs, _ = env.reset(options={"start": walk.subgoal})
+    action, _ = walk.learner.predict(obs, deterministic=True)
+    assert env.step(action)[2]
 
 
 def test_sb3_learns_on_option_env() -> None:

@@ -3,7 +3,6 @@
 import csv
 import warnings
 from pathlib import Path
-from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -42,6 +41,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
 from sb3_skillgraph import SkillGraphAgent
+from sb3_skillgraph.runner import RunnerState
 
 
 class Counting(BaseCallback):
@@ -92,7 +92,7 @@ def test_is_an_off_policy_algorithm() -> None:
     assert agent.num_timesteps == 20
     assert isinstance(agent.get_env(), VecEnv)
     assert agent.get_vec_normalize_env() is None
-    assert agent.policy is agent.global_option.learner.policy
+    assert agent.policy is agent.parts.walker.learner.policy
     assert (agent.n_envs, agent.seed, agent.verbose) == (1, 0, 0)
 
 
@@ -100,8 +100,20 @@ def test_constructor_takes_sb3_arguments_in_sb3_order() -> None:
     def names(cls: type[BaseAlgorithm]) -> list[str]:
         return list(cls.__init__.__code__.co_varnames[1 : cls.__init__.__code__.co_argcount])
 
-    theirs = [name for name in names(TD3) if name not in ("policy_delay", "target_policy_noise", "target_noise_clip")]
-    assert names(SkillGraphAgent) == theirs
+    gone = {"replay_buffer_class", "replay_buffer_kwargs", "optimize_memory_usage", "n_steps"}
+    gone |= {"policy_delay", "target_policy_noise", "target_noise_clip"}
+    assert names(SkillGraphAgent) == [name for name in names(TD3) if name not in gone]
+    assert SkillGraphAgent.__init__.__code__.co_kwonlyargcount + len(names(SkillGraphAgent)) <= 32
+
+
+@pytest.mark.parametrize("name", ["replay_buffer_class", "use_sde", "n_steps", "gestation_period", "anything"])
+def test_unknown_arguments_are_type_errors(trained_files: tuple[Path, Path], name: str) -> None:
+    with pytest.raises(TypeError, match=name):
+        new_agent(**{name: None})
+    with pytest.raises(TypeError, match=name):
+        SkillGraphAgent.load(trained_files[0], **{name: None})
+    with pytest.raises(TypeError, match=name):
+        SkillGraphAgent.load(trained_files[0], custom_objects={name: None})
 
 
 def test_learn_counts_steps_as_sb3_does() -> None:
@@ -111,7 +123,7 @@ def test_learn_counts_steps_as_sb3_does() -> None:
     assert agent.num_timesteps == 10
     agent.learn(10, reset_num_timesteps=False)
     assert agent.num_timesteps == 20
-    assert agent.store.total == 52
+    assert agent.parts.store.total == 52
 
 
 # -- vectorised environments ------------------------------------------------------------------------------------------
@@ -123,7 +135,7 @@ def test_vectorised_environments(n_envs: int, monitored: bool) -> None:
     recorders = [Recorder(gym.make(TOY, max_steps=40)) for _ in range(n_envs)]
     envs = [Monitor(env) if monitored else env for env in recorders]
     agent = new_agent(DummyVecEnv([lambda env=env: env for env in envs])).learn(420)
-    assert agent.num_timesteps == agent.store.total == 420
+    assert agent.num_timesteps == agent.parts.store.total == 420
     for i, recorder in enumerate(recorders):
         check_store(agent, recorder.transitions, i)
     assert agent._episode_num == n_envs * (420 // n_envs // 40)
@@ -145,7 +157,7 @@ def test_worker_processes_give_the_same_as_one_process() -> None:
 @pytest.mark.mujoco
 def test_on_a_simulator(tmp_path: Path) -> None:
     agent = new_agent(new_vec_env(POINT, max_steps=100)).learn(400)
-    assert agent.store.total == 400
+    assert agent.parts.store.total == 400
     agent.save(tmp_path / "agent")
     loaded = SkillGraphAgent.load(tmp_path / "agent")
     obs = agent.env.reset()
@@ -155,11 +167,11 @@ def test_on_a_simulator(tmp_path: Path) -> None:
 
 def test_set_env(trained: SkillGraphAgent) -> None:
     env = Recorder(gym.make(TOY))
-    total, n_steps = trained.store.total, trained.num_timesteps
+    total, n_steps = trained.parts.store.total, trained.num_timesteps
     trained.learn(30, reset_num_timesteps=False)
     trained.set_env(env)
     trained.learn(30, reset_num_timesteps=False)
-    assert trained.store.total == total + 60
+    assert trained.parts.store.total == total + 60
     assert trained.num_timesteps == n_steps + 60
     assert len(env.starts) == 1
     assert len(env.transitions) == 30
@@ -177,13 +189,14 @@ def test_predict_one_observation_or_a_batch(trained: SkillGraphAgent) -> None:
     action, state = trained.predict(one_observation())
     assert action.shape == (2,)
     assert trained.action_space.contains(action)
-    assert all(array.shape == (1,) for array in state)
+    assert all(len(array) == 1 for array in state)
     actions, states = trained.predict(batch(7))
     assert actions.shape == (7, 2)
-    assert all(array.shape == (7,) for array in states)
+    assert all(len(array) == 7 for array in states)
     for i in range(7):
-        single, _ = trained.predict({key: value[i] for key, value in batch(7).items()})
+        single, one = trained.predict({key: value[i] for key, value in batch(7).items()})
         np.testing.assert_allclose(single, actions[i], atol=1e-6)
+        assert trained.running(one) == [trained.running(states)[i]]
 
 
 def test_predict_keeps_its_state_outside_and_forgets_it_at_an_episode_start(trained: SkillGraphAgent) -> None:
@@ -193,14 +206,14 @@ def test_predict_keeps_its_state_outside_and_forgets_it_at_an_episode_start(trai
     start = np.zeros(5, dtype=bool)
     second, later = trained.predict(observations, state=state, episode_start=start)
     assert differences(kept, state) == []  # what was passed in is not written to
-    assert not np.array_equal(state[1], later[1])  # steps the options have run
+    assert [RunnerState(*each).elapsed.tolist() for each in (state, later)] == [[1.0] * 5, [2.0] * 5]
     again, fresh = trained.predict(observations, state=later, episode_start=~start)
     assert differences((first, kept), (again, fresh)) == []
     mixed = np.array([True, False, False, True, False])
     _, state = trained.predict(observations, state=later, episode_start=mixed)
     _, running = trained.predict(observations, state=later, episode_start=start)
     for got, new, old in zip(state, kept, running, strict=True):
-        np.testing.assert_array_equal(got, np.where(mixed, new, old))
+        np.testing.assert_array_equal(got, np.where(mixed.reshape(-1, *[1] * (got.ndim - 1)), new, old))
     assert second.shape == first.shape
 
 
@@ -246,14 +259,14 @@ def test_a_callback_that_stops_leaves_no_trace_of_its_step(stop_at: int) -> None
     agent = new_agent(env)
     agent.learn(500, callback=Counting(stop_at))
     assert agent.num_timesteps == stop_at
-    assert agent.store.total == stop_at - 1
+    assert agent.parts.store.total == stop_at - 1
     stopped = env.transitions.pop()
     check_store(agent, env.transitions)
     # Apart from the counter and the environment, the agent is one that was told to learn a step less.
     ours = state_of(agent)["agent"]
     if stop_at > 1:
         theirs = state_of(new_agent(gym.make(TOY, max_steps=40)).learn(stop_at - 1))["agent"]
-        for name in ("options", "parameters", "graph", "chaining", "discovery", "visited"):
+        for name in ("parameters", "graph", "model", "walker"):
             assert differences(theirs[name], ours[name]) == [], name
         assert differences(theirs["progress"]["rng"], ours["progress"]["rng"]) == []
     n_starts = len(env.starts)
@@ -271,7 +284,7 @@ def test_a_stopped_step_is_forgotten_by_the_generators_too() -> None:
     twin.set_env(twin.get_env())  # forces a fresh episode
     for agent in (stopped, twin):
         agent.learn(100, reset_num_timesteps=False)
-    assert differences(state_of(twin)["replay"]["store"], state_of(stopped)["replay"]["store"]) == []
+    assert differences(state_of(twin)["replay"], state_of(stopped)["replay"]) == []
 
 
 def test_the_stock_callbacks(tmp_path: Path) -> None:
@@ -301,10 +314,10 @@ def test_the_stock_callbacks(tmp_path: Path) -> None:
     resumed = SkillGraphAgent.load(tmp_path / "checkpoints" / "dsg_300_steps", env=gym.make(TOY))
     resumed.load_replay_buffer(tmp_path / "checkpoints" / "dsg_replay_buffer_300_steps.pkl")
     assert resumed.num_timesteps == 300
-    assert resumed.store.total == 299  # a checkpoint is taken between a step and its storing
+    assert resumed.parts.store.total == 299  # a checkpoint is taken between a step and its storing
     resumed.learn(100, reset_num_timesteps=False)
     assert resumed.num_timesteps == 400
-    assert resumed.store.total == 399
+    assert resumed.parts.store.total == 399
 
 
 def test_stopping_on_episodes_and_on_reward() -> None:
@@ -340,19 +353,19 @@ torch.set_num_threads(3)
 import sb3_skillgraph
 assert torch.get_num_threads() == 3, "importing the library must not set threads"
 from conftest import new_agent
-agent = new_agent().learn(900)
+agent = new_agent().learn(600)
 agent.save(sys.argv[1])
 agent.save_replay_buffer(sys.argv[2])
 """
 
 
 def test_the_same_seed_gives_the_same_agent(tmp_path: Path) -> None:
-    first, second = (without_clock(state_of(new_agent().learn(900))) for _ in range(2))
+    first, second = (without_clock(state_of(new_agent().learn(600))) for _ in range(2))
     assert differences(first, second) == []
     in_new_process(AGAIN, tmp_path / "agent.zip", tmp_path / "replay.zip", hash_seed=77)
     assert differences(first, without_clock(state_in(tmp_path / "agent.zip", tmp_path / "replay.zip"))) == []
-    assert len(first["agent"]["graph"]["edges"]) > 2
-    other = without_clock(state_of(new_agent(seed=1).learn(900)))
+    assert len(first["agent"]["graph"]["edges"]["source"]) > 20
+    other = without_clock(state_of(new_agent(seed=1).learn(600)))
     assert differences(first["agent"]["graph"], other["agent"]["graph"]) != []
 
 
@@ -366,7 +379,8 @@ def test_without_a_seed_agents_differ() -> None:
 KEYS = {
     *("rollout/ep_rew_mean", "rollout/ep_len_mean", "rollout/success_rate"),
     *("train/actor_loss", "train/critic_loss", "train/learning_rate", "train/n_updates"),
-    *("skillgraph/events", "skillgraph/options", "skillgraph/edges", "skillgraph/joined_pairs", "skillgraph/coverage"),
+    *("skillgraph/events", "skillgraph/salient_events", "skillgraph/edges", "skillgraph/tried_edges"),
+    *("skillgraph/success_rate", "skillgraph/stuck"),
 }
 TABLE_KEYS = {"time/episodes", "time/fps", "time/time_elapsed", "time/total_timesteps"}
 
@@ -382,10 +396,9 @@ def test_csv_log(tmp_path: Path) -> None:
     assert [int(entry["time/total_timesteps"]) for entry in entries] == list(range(200, 2001, 200))
     last = {key: float(value) for key, value in entries[-1].items()}
     assert last["skillgraph/events"] == len(agent.events)
-    assert last["skillgraph/edges"] > 0
+    assert last["skillgraph/edges"] == agent.graph.edges.size > last["skillgraph/tried_edges"] > 0
+    assert 0.0 < last["skillgraph/success_rate"] < 1.0
     assert last["rollout/ep_len_mean"] == 100
-    for name in ("joined_pairs", "coverage"):
-        assert 0.0 < last[f"skillgraph/{name}"] <= 1.0
     assert last["train/n_updates"] == 1799  # an entry is written before the updates of its step
 
 
@@ -408,7 +421,7 @@ def test_table_and_silence(capsys: pytest.CaptureFixture[str]) -> None:
     SkillGraphAgent("MultiInputPolicy", gym.make(TOY), **{**EAGER, "verbose": 1}).learn(250, log_interval=1)
     table = capsys.readouterr().out
     assert "skillgraph/" in table
-    assert "coverage" in table
+    assert "tried_edges" in table
 
 
 def test_nothing_is_left_open(tmp_path: Path) -> None:
@@ -422,11 +435,17 @@ def test_nothing_is_left_open(tmp_path: Path) -> None:
 
 def test_what_is_learned_is_no_secret(trained: SkillGraphAgent) -> None:
     """The attributes users are promised."""
-    assert [event.id for event in trained.events] == [f"e{i}" for i in range(len(trained.events))]
-    option = trained.options[0]
-    assert trained.options["o1"] is trained.options.o1 is option
-    nodes: dict[str, Any] = dict(trained.graph.nx.nodes(data="item"))
-    assert set(nodes) == {event.id for event in trained.events} | {o.id for o in trained.options if o.mature}
-    for _, _, attributes in trained.graph.nx.edges(data=True):
-        assert attributes["weight"] >= 0.0
-        assert 0.0 < attributes["success_rate"] <= 1.0
+    ids = [event.id for event in trained.events]
+    assert [event.id for event in trained.graph.events] == ids == [f"e{i}" for i in range(len(ids))]
+    assert [(option.id, option.target) for option in trained.options] == [(f"w{i}", id) for i, id in enumerate(ids)]
+    for option, event in zip(trained.options, trained.events, strict=True):
+        assert option.termination is event
+        assert option.learner is trained.parts.walker.learner
+        assert option.contains(event.center[None]).all()
+    assert set(trained.graph.nx.nodes) == {*ids, *(option.id for option in trained.options)}
+    for source, target, attributes in trained.graph.nx.edges(data=True):
+        record = {"forward", "backward", "crossing_steps", "successes", "success_steps", "failures"}
+        assert set(attributes) == (record if source in ids else {"rate"})
+        assert (source in ids) != (target in ids)
+        assert all(value >= 0.0 for value in attributes.values())
+    assert repr(trained) == f"<SkillGraphAgent after {trained.num_timesteps} steps: {trained.graph!r}>"

@@ -82,8 +82,8 @@ def test_somebody_elses_ant_learns_with_the_shipped_settings(robotics_ant: gym.E
     settings = {**load_hyperparams("SkillGraph/AntUMaze-v0"), "learning_starts": 50, "batch_size": 16, "option_view": "body"}
     del settings["n_timesteps"]
     agent = SkillGraphAgent(env=robotics_ant, event_radius=0.45, seed=0, **settings).learn(120)
-    assert agent.store.total == 120
-    assert agent.global_option.learner._n_updates > 0
+    assert agent.parts.store.total == 120
+    assert agent.parts.walker.learner._n_updates > 0
 
 
 @pytest.mark.mujoco

@@ -61,11 +61,12 @@ class OGBenchMazeEnv(GoalTask):
         self._skip, self.option_view, self.body_radius = _BODIES[kind]
         self.start_margin = 0.5 * self.body_radius
         with private_temporary_directory():  # OGBench leaves the model's file behind
-            self.maze: Any = gym.make(name, terminate_at_goal=False).unwrapped
+            maze: Any = gym.make(name, terminate_at_goal=False).unwrapped
+        self.maze = maze
         self.render_mode = render_mode
         self.action_space = self.maze.action_space
         self._init_task(self._geometry(), success_radius or self.maze._goal_tol, max_steps, terminate_on_success)
-        n_numbers = self.maze.observation_space.shape[0] - self._skip
+        n_numbers = len(self.maze.get_ob()) - self._skip
         position, body = (spaces.Box(-np.inf, np.inf, (n,), np.float64) for n in (2, n_numbers))
         self.observation_space = spaces.Dict({"observation": body, "achieved_goal": position, "desired_goal": position})
         self._place(self.goal)
