@@ -1,7 +1,6 @@
 """The agent: an SB3 off-policy algorithm that explores, learns to walk, and plans over what it has learned (section 3)."""
 
 import copy
-import io
 from collections.abc import Iterable
 from typing import Any, ClassVar, Literal, TypeVar
 
@@ -10,11 +9,11 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.noise import ActionNoise, VectorizedActionNoise
+from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
-from stable_baselines3.common.utils import check_for_correct_spaces, get_system_info
+from stable_baselines3.common.utils import get_system_info
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 from stable_baselines3.td3.policies import MultiInputPolicy
 
@@ -215,15 +214,11 @@ class SkillGraphAgent(OffPolicyAlgorithm):
         progress_bar: bool = False,
     ) -> SelfSkillGraphAgent:
         """
-        Explore and learn, without reward, as any SB3 off-policy algorithm does with one.
+        Explore and learn, without reward. The arguments are those of SB3's off-policy algorithms.
 
-        :param total_timesteps: environment steps, over all environments
-        :param callback: SB3 callback(s), called at every step
-        :param log_interval: episodes between log entries
-        :param tb_log_name: name of the run for TensorBoard
-        :param reset_num_timesteps: False continues the last call: counters go on, and environments that can tell their
-            state are put where they were
-        :param progress_bar: show a progress bar
+        With ``reset_num_timesteps=False`` it continues the last call: counters go on, and environments that can tell their
+        state are put where they were.
+
         :return: the agent
         :raises ValueError: if an observation holds NaN or inf
         """
@@ -325,19 +320,9 @@ class SkillGraphAgent(OffPolicyAlgorithm):
     def graph_summary(self) -> dict[str, float]:
         """Describe the graph in numbers.
 
-        :return: ``events``, ``salient_events`` among them and ``edges``; ``tried_edges``, of which a run is known;
-            ``success_rate`` of those, by runs; ``stuck``, episodes given up since the agent was stuck
+        :return: what :meth:`SkillGraph.summary` returns, and ``stuck``, the episodes given up since the agent was stuck
         """
-        edges = self.graph.edges
-        runs = float((edges.successes + edges.failures).sum())
-        return {
-            "events": len(self.graph.events),
-            "salient_events": sum(event.salient for event in self.graph.events),
-            "edges": edges.size,
-            "tried_edges": int(np.count_nonzero(edges.successes + edges.failures)),
-            "success_rate": float(edges.successes.sum()) / runs if runs else 0.0,
-            "stuck": self.parts.rollout.n_stuck,
-        }
+        return {**self.graph.summary(), "stuck": self.parts.rollout.n_stuck}
 
     # -- acting -------------------------------------------------------------------------------------------------------
 
@@ -545,25 +530,7 @@ class SkillGraphAgent(OffPolicyAlgorithm):
         """
         if print_system_info:
             get_system_info()
-        tree = load_tree(path, "agent")
-        arguments = {"policy": "MultiInputPolicy", **tree["arguments"], "device": device, **(custom_objects or {}), **kwargs}
-        persistence.require_callables(arguments)
-        agent = cls(env=None, _init_setup_model=False, **arguments)
-        agent.observation_space = persistence.make_space(tree["spaces"]["observation"])
-        agent.action_space = persistence.make_space(tree["spaces"]["action"])
-        agent.n_envs = tree["n_envs"]
-        if env is not None:
-            wrapped = cls._wrap_env(env, agent.verbose)
-            refuse_vec_normalize(wrapped)
-            check_for_correct_spaces(wrapped, agent.observation_space, agent.action_space)
-            agent.env, agent.n_envs = wrapped, wrapped.num_envs
-        noise = agent.action_noise
-        if isinstance(noise, VectorizedActionNoise) and noise.n_envs != agent.n_envs:
-            agent.action_noise = noise.base_noise
-        agent._setup_model()
-        persistence.restore(agent, tree, same_envs=agent.n_envs == tree["n_envs"] and not force_reset)
-        agent._loaded = True
-        return agent
+        return persistence.load(cls, path, env, device, {**(custom_objects or {}), **kwargs}, force_reset)
 
     def copy(self: SelfSkillGraphAgent, env: GymEnv) -> SelfSkillGraphAgent:
         """
@@ -572,14 +539,7 @@ class SkillGraphAgent(OffPolicyAlgorithm):
         :param env: environment of the copy
         :return: the copy
         """
-        agent_file, replay_file = io.BytesIO(), io.BytesIO()
-        self.save(agent_file)
-        self.save_replay_buffer(replay_file)
-        # What is stored by name only is given again.
-        named = {name: value for name, value in self._arguments.items() if callable(value) or hasattr(value, "propose")}
-        agent = type(self).load(agent_file, env=env, device=self.device, **named)
-        agent.load_replay_buffer(replay_file)
-        return agent
+        return persistence.copy(self, env)
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         """

@@ -4,7 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_skillgraph.graph import NOWHERE, SkillGraph
+from sb3_skillgraph.edges import NOWHERE
+from sb3_skillgraph.graph import SkillGraph
 from sb3_skillgraph.walk_model import Kind, WalkModel
 
 #: What to count on for the success of options, in standard deviations above what is expected: while learning, so that what is

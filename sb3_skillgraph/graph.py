@@ -5,17 +5,13 @@ from typing import Any
 import networkx
 import numpy as np
 
+from sb3_skillgraph.edges import NOWHERE, Edges
 from sb3_skillgraph.events import Event
 
-#: What stands in place of an event's index where there is none. Of an array with one more entry than there are events it
-#: is the last entry.
-NOWHERE = -1
 #: Landmarks lie at least so many event radii apart: 1.5 to 3 make the same agent, fewer make plans cheaper.
 SPACING = 1.5
 #: Edges out of an event, at most (a few more until they are next looked through); a plan looks at all of them.
 MAX_DEGREE = 24
-#: Different events in which failed runs of one edge have landed that are told apart.
-MAX_LANDINGS = 4
 #: Half of its training ago the walker was another one: what ran then counts half as much, to this power.
 AGING = 1.0
 #: Updates of the walker before which runs do not age: all of its training so far would be "half of it ago".
@@ -23,86 +19,8 @@ YOUNG = 500.0
 #: By how much the cover's radius grows when there are too many events.
 GROWTH = 1.25
 
-_NUMBERS = ("forward", "backward", "crossing_steps", "successes", "success_steps", "failures", "updated")
-
-
-class Edges:
-    """Which options can be begun in which events, and how they did: one row for each pair, in growing arrays.
-
-    ``source`` and ``target`` are indices of events; the option is the walk to ``target``.
-
-    ``forward``, ``backward``: how often trajectories went from source to target, and the other way, in few steps
-    ``crossing_steps``: environment steps they took from source to target in the mean (backwards where none went forward)
-    ``successes``, ``failures``: runs, weighted by age; ``success_steps``: steps of the successful ones, summed likewise
-    ``landing``, ``landing_weight``: the events where failed runs landed, and how many, shape ``(n, MAX_LANDINGS)``
-    ``updated``: the time (updates of the walker) for which the weights hold
-    """
-
-    def __init__(self) -> None:
-        self.size = 0
-        self._arrays: dict[str, np.ndarray] = {
-            "source": np.zeros(64, dtype=np.int64),
-            "target": np.zeros(64, dtype=np.int64),
-            "landing": np.full((64, MAX_LANDINGS), NOWHERE, dtype=np.int64),
-            "landing_weight": np.zeros((64, MAX_LANDINGS)),
-            **{name: np.zeros(64) for name in _NUMBERS},
-        }
-        self._rows: dict[tuple[int, int], int] = {}
-
-    def __getattr__(self, name: str) -> np.ndarray:
-        try:
-            return self.__dict__["_arrays"][name][: self.__dict__["size"]]
-        except KeyError as error:
-            raise AttributeError(name) from error
-
-    def find(self, source: int, target: int) -> int | None:
-        """Return the row of a pair of events; None if there is no such edge."""
-        return self._rows.get((source, target))
-
-    def add(self, source: int, target: int, now: float) -> int:
-        """Return the row of a pair of events, which is made if there is none.
-
-        :param source: index of the event that the option is begun in
-        :param target: index of the event that it leads to
-        :param now: the time, in updates of the walker
-        """
-        row = self._rows.get((source, target))
-        if row is not None:
-            return row
-        row = self.size
-        if row == len(self._arrays["source"]):
-            for name, array in self._arrays.items():
-                self._arrays[name] = np.concatenate([array, np.zeros_like(array)])
-        for array in self._arrays.values():
-            array[row] = 0
-        self._arrays["landing"][row] = NOWHERE
-        self._arrays["source"][row], self._arrays["target"][row], self._arrays["updated"][row] = source, target, now
-        self._rows[source, target] = row
-        self.size += 1
-        return row
-
-    def keep(self, rows: np.ndarray) -> None:
-        """Let go of all other rows.
-
-        :param rows: row numbers, ascending
-        """
-        for array in self._arrays.values():
-            array[: len(rows)] = array[rows]
-        self.size = len(rows)
-        pairs = zip(self.source.tolist(), self.target.tolist(), strict=True)
-        self._rows = {pair: row for row, pair in enumerate(pairs)}
-
-    def get_state(self) -> dict[str, np.ndarray]:
-        """Return all columns."""
-        return {name: array[: self.size].copy() for name, array in self._arrays.items()}
-
-    def set_state(self, state: dict[str, np.ndarray]) -> None:
-        """Restore what :meth:`get_state` returned."""
-        self.size = len(state["source"])
-        self._arrays = {name: np.array(state[name]) for name in self._arrays}
-        if self.size == 0:
-            self._arrays = Edges()._arrays
-        self.keep(np.arange(self.size))
+#: What the picture of an edge shows of its record.
+_SHOWN = ("forward", "backward", "crossing_steps", "successes", "success_steps", "failures")
 
 
 class SkillGraph:
@@ -345,7 +263,7 @@ class SkillGraph:
             place = {f"x{k}": float(x) for k, x in enumerate(event.center)}
             graph.add_node(event.id, kind="event", salient=event.salient, radius=event.radius, **place)
             graph.add_node(self.walk_ids[i], kind="walk", target=event.id)
-        columns = {name: getattr(edges, name).tolist() for name in _NUMBERS if name != "updated"}
+        columns = {name: getattr(edges, name).tolist() for name in _SHOWN}
         landed: dict[tuple[str, str], float] = {}
         for row, (source, target) in enumerate(zip(edges.source.tolist(), edges.target.tolist(), strict=True)):
             walk = self.walk_ids[target]
@@ -361,6 +279,21 @@ class SkillGraph:
         for (walk, end), weight in landed.items():
             graph.add_edge(walk, end, rate=weight / runs[self.index(graph.nodes[walk]["target"])])
         return graph
+
+    def summary(self) -> dict[str, float]:
+        """Describe the graph in numbers.
+
+        :return: ``events``, ``salient_events`` among them and ``edges``; ``tried_edges``, of which a run is known, and the
+            ``success_rate`` of those runs
+        """
+        runs = self.edges.successes + self.edges.failures
+        return {
+            "events": len(self.events),
+            "salient_events": sum(event.salient for event in self.events),
+            "edges": self.edges.size,
+            "tried_edges": int(np.count_nonzero(runs)),
+            "success_rate": float(self.edges.successes.sum() / max(runs.sum(), 1e-9)),
+        }
 
     # -- saving -------------------------------------------------------------------------------------------------------
 

@@ -1,5 +1,6 @@
 """An agent to and from plain data: nothing is ever unpickled."""
 
+import io
 import random
 from collections import deque
 from collections.abc import Iterable
@@ -9,9 +10,12 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.noise import VectorizedActionNoise
+from stable_baselines3.common.utils import check_for_correct_spaces
 
+from sb3_skillgraph.goal_env import refuse_vec_normalize
 from sb3_skillgraph.options.learner import OptionDDPG, OptionTD3
-from sb3_skillgraph.saving import MissingCallable, known_class
+from sb3_skillgraph.saving import MissingCallable, PathOrFile, known_class, load_tree
 
 for _option_class in (OptionDDPG, OptionTD3):
     known_class(_option_class)
@@ -84,6 +88,55 @@ def _snapshot(agent: Any) -> dict[str, Any] | None:
     if all(env.env_is_wrapped(Monitor)):
         snapshot["monitor_rewards"] = [list(map(float, rewards)) for rewards in env.get_attr("rewards")]
     return snapshot
+
+
+def load(cls: Any, path: PathOrFile, env: Any, device: Any, given: dict[str, Any], force_reset: bool) -> Any:
+    """Make the agent that a file holds.
+
+    :param cls: :class:`~sb3_skillgraph.SkillGraphAgent`
+    :param path: path (with or without ``.zip``) or binary file object
+    :param env: environment to go on with; None to only predict
+    :param device: torch device
+    :param given: arguments to use in place of the saved ones
+    :param force_reset: whether ``learn`` is to begin at a fresh episode
+    :raises ValueError: if the file is damaged, or does not fit
+    :raises TypeError: if there is no such argument
+    """
+    tree = load_tree(path, "agent")
+    arguments = {"policy": "MultiInputPolicy", **tree["arguments"], "device": device, **given}
+    require_callables(arguments)
+    agent = cls(env=None, _init_setup_model=False, **arguments)
+    agent.observation_space = make_space(tree["spaces"]["observation"])
+    agent.action_space = make_space(tree["spaces"]["action"])
+    agent.n_envs = tree["n_envs"]
+    if env is not None:
+        wrapped = cls._wrap_env(env, agent.verbose)
+        refuse_vec_normalize(wrapped)
+        check_for_correct_spaces(wrapped, agent.observation_space, agent.action_space)
+        agent.env, agent.n_envs = wrapped, wrapped.num_envs
+    noise = agent.action_noise
+    if isinstance(noise, VectorizedActionNoise) and noise.n_envs != agent.n_envs:
+        agent.action_noise = noise.base_noise
+    agent._setup_model()
+    restore(agent, tree, same_envs=agent.n_envs == tree["n_envs"] and not force_reset)
+    agent._loaded = True
+    return agent
+
+
+def copy(agent: Any, env: Any) -> Any:
+    """Return an agent that knows the same, replay buffer included.
+
+    :param agent: a :class:`~sb3_skillgraph.SkillGraphAgent`
+    :param env: environment of the copy
+    """
+    agent_file, replay_file = io.BytesIO(), io.BytesIO()
+    agent.save(agent_file)
+    agent.save_replay_buffer(replay_file)
+    # What is stored by name only is given again.
+    named = {name: value for name, value in agent._arguments.items() if callable(value) or hasattr(value, "propose")}
+    twin = load(type(agent), agent_file, env, agent.device, named, force_reset=False)
+    twin.load_replay_buffer(replay_file)
+    return twin
 
 
 def restore(agent: Any, tree: dict[str, Any], same_envs: bool) -> None:

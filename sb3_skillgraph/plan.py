@@ -5,7 +5,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from sb3_skillgraph.choices import PESSIMISTIC
-from sb3_skillgraph.graph import NOWHERE
+from sb3_skillgraph.edges import NOWHERE
 from sb3_skillgraph.planning import DIRECT, GOAL, Solution
 from sb3_skillgraph.runner import Runner, RunnerState
 

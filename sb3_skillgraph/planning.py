@@ -6,7 +6,8 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from sb3_skillgraph.choices import EXPECTED, NO_RUNS, PESSIMISTIC, ChoiceModel, Choices, Runs, Start
-from sb3_skillgraph.graph import NOWHERE, SkillGraph
+from sb3_skillgraph.edges import NOWHERE
+from sb3_skillgraph.graph import SkillGraph
 from sb3_skillgraph.walk_model import WalkModel
 
 #: Id of the option that walks to the goal itself.
@@ -20,7 +21,7 @@ PRECISION, MAX_SWEEPS = 0.5, 300
 #: Bins of time in which the success within the horizon is worked out.
 TIME_BINS = 200
 #: Share of the failures that will happen again and again: what a policy without noise cannot do from some place it never can.
-FOR_GOOD = 0.05
+FOR_GOOD = 0.075
 #: Probability that a plan promises at least: nothing is impossible.
 LEAST = 1e-6
 #: Opinions of how well options do, in standard deviations: as far apart as the fifths of a normal distribution.

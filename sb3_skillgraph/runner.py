@@ -8,7 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from sb3_skillgraph.choices import PESSIMISTIC, Runs, Start
-from sb3_skillgraph.graph import NOWHERE, SkillGraph
+from sb3_skillgraph.edges import NOWHERE
+from sb3_skillgraph.graph import SkillGraph
 from sb3_skillgraph.options.numpy_actor import NumpyActor
 from sb3_skillgraph.options.views import View
 from sb3_skillgraph.planning import DIRECT, GOAL, Planner, Solution, timeout

@@ -1,0 +1,133 @@
+"""The edges of a skill graph and the records of the runs on them, as arrays that a planner can read at once."""
+
+import numpy as np
+
+#: What stands in place of an event's index where there is none. Of an array with one more entry than there are events it
+#: is the last entry.
+NOWHERE = -1
+#: Different events in which failed runs of one edge have landed that are told apart.
+MAX_LANDINGS = 4
+
+_INDICES, _LANDINGS = ("source", "target"), ("landing", "landing_weight")
+_NUMBERS = ("forward", "backward", "crossing_steps", "successes", "success_steps", "failures", "updated")
+
+
+class Edges:
+    """Which options can be begun in which events, and how they did: one row for each pair.
+
+    The columns are views of arrays that grow: what is written into them is kept, until :meth:`add` or :meth:`keep`.
+    """
+
+    def __init__(self) -> None:
+        self.size = 0
+        self._arrays: dict[str, np.ndarray] = {
+            **{name: np.zeros(64, dtype=np.int64) for name in _INDICES},
+            "landing": np.full((64, MAX_LANDINGS), NOWHERE, dtype=np.int64),
+            "landing_weight": np.zeros((64, MAX_LANDINGS)),
+            **{name: np.zeros(64) for name in _NUMBERS},
+        }
+        self._rows: dict[tuple[int, int], int] = {}
+
+    @property
+    def source(self) -> np.ndarray:
+        """Index of the event that the option is begun in, shape ``(n_edges,)`` like all that follow."""
+        return self._arrays["source"][: self.size]
+
+    @property
+    def target(self) -> np.ndarray:
+        """Index of the event that it leads to; the option is the walk to it."""
+        return self._arrays["target"][: self.size]
+
+    @property
+    def forward(self) -> np.ndarray:
+        """How often trajectories went from source to target in few steps."""
+        return self._arrays["forward"][: self.size]
+
+    @property
+    def backward(self) -> np.ndarray:
+        """How often they went the other way."""
+        return self._arrays["backward"][: self.size]
+
+    @property
+    def crossing_steps(self) -> np.ndarray:
+        """Environment steps they took from source to target in the mean; backwards, where none went forward."""
+        return self._arrays["crossing_steps"][: self.size]
+
+    @property
+    def successes(self) -> np.ndarray:
+        """Runs that succeeded, weighted by age."""
+        return self._arrays["successes"][: self.size]
+
+    @property
+    def success_steps(self) -> np.ndarray:
+        """Environment steps of those, summed with the same weights."""
+        return self._arrays["success_steps"][: self.size]
+
+    @property
+    def failures(self) -> np.ndarray:
+        """Runs that failed, weighted by age."""
+        return self._arrays["failures"][: self.size]
+
+    @property
+    def updated(self) -> np.ndarray:
+        """The time, in updates of the walker, for which the weights hold."""
+        return self._arrays["updated"][: self.size]
+
+    @property
+    def landing(self) -> np.ndarray:
+        """Events in which failed runs landed, shape ``(n_edges, MAX_LANDINGS)``."""
+        return self._arrays["landing"][: self.size]
+
+    @property
+    def landing_weight(self) -> np.ndarray:
+        """The weight of those runs, same shape; 0 where there is none."""
+        return self._arrays["landing_weight"][: self.size]
+
+    def find(self, source: int, target: int) -> int | None:
+        """Return the row of a pair of events; None if there is no such edge."""
+        return self._rows.get((source, target))
+
+    def add(self, source: int, target: int, now: float) -> int:
+        """Return the row of a pair of events, which is made if there is none.
+
+        :param source: index of the event that the option is begun in
+        :param target: index of the event that it leads to
+        :param now: the time, in updates of the walker
+        """
+        row = self._rows.get((source, target))
+        if row is not None:
+            return row
+        row = self.size
+        if row == len(self._arrays["source"]):
+            for name, array in self._arrays.items():
+                self._arrays[name] = np.concatenate([array, np.zeros_like(array)])
+        for array in self._arrays.values():
+            array[row] = 0
+        self._arrays["landing"][row] = NOWHERE
+        self._arrays["source"][row], self._arrays["target"][row], self._arrays["updated"][row] = source, target, now
+        self._rows[source, target] = row
+        self.size += 1
+        return row
+
+    def keep(self, rows: np.ndarray) -> None:
+        """Let go of all other rows.
+
+        :param rows: row numbers, ascending
+        """
+        for array in self._arrays.values():
+            array[: len(rows)] = array[rows]
+        self.size = len(rows)
+        pairs = zip(self.source.tolist(), self.target.tolist(), strict=True)
+        self._rows = {pair: row for row, pair in enumerate(pairs)}
+
+    def get_state(self) -> dict[str, np.ndarray]:
+        """Return all columns."""
+        return {name: array[: self.size].copy() for name, array in self._arrays.items()}
+
+    def set_state(self, state: dict[str, np.ndarray]) -> None:
+        """Restore what :meth:`get_state` returned."""
+        self.size = len(state["source"])
+        self._arrays = {name: np.array(state[name]) for name in self._arrays}
+        if self.size == 0:
+            self._arrays = Edges()._arrays
+        self.keep(np.arange(self.size))
