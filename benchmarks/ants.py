@@ -7,9 +7,9 @@ random goals at least 2 cells of path away, as ``evaluate_pairs`` draws them; th
 of 0.1 s tells whether it was reached within 0.45 m (the success radius), 0.6 m (the paper's) and 0.6 of a cell (2.4 m, about
 what DHRL asks for: 5 m in cells of 8 m). *Far goal*: from the training start to the free cell with the longest path, 32 times.
 *Floor*: from the training start to 100 goals anywhere on the floor, however near to a wall, where the body has no room.
-*Straight*: the random pairs by the same agent without planning, its global option walking straight to the goal. An episode
-ends when the ant is on its back. *Cells*: share of the maze's free squares of 1 m that were visited in the last 50 000 steps
-of training, and by a random walk in as many (its episodes end with a fall, too).
+*Straight*: the random pairs by the same agent without plans, its walker going straight on to the goal. An episode ends when
+the ant is on its back. *Cells*: share of the maze's free squares of 1 m that were visited in the last 50 000 steps of
+training, and by a random walk in as many (its episodes end with a fall, too).
 """
 
 import argparse
@@ -24,10 +24,10 @@ import gymnasium as gym
 import numpy as np
 import torch as th
 
-from sb3_skillgraph import SkillGraphAgent, __version__
-from sb3_skillgraph.baselines import random_walk
+from sb3_skillgraph import __version__
+from sb3_skillgraph.baselines import StraightOn, random_walk
 from sb3_skillgraph.envs import MazeGeometry
-from sb3_skillgraph.evaluation import run_pair, sample_pairs
+from sb3_skillgraph.evaluation import Predictor, run_pair, sample_pairs
 from sb3_skillgraph.run_folder import CONFIG, checkpoints, load_agent
 
 TOLERANCES = {"0.45 m": 0.45, "0.6 m": 0.6, "0.6 cells": 2.4}
@@ -35,7 +35,7 @@ WALKS = ("pairs", "far", "floor", "straight")
 N_PAIRS, N_FAR, N_LAST = 100, 32, 50_000
 
 
-def walk(agent: SkillGraphAgent, env: gym.Env, pairs: Sequence[tuple[np.ndarray | None, np.ndarray]]) -> list[dict[str, Any]]:
+def walk(agent: Predictor, env: gym.Env, pairs: Sequence[tuple[np.ndarray | None, np.ndarray]]) -> list[dict[str, Any]]:
     """Go from starts (None: the training start) to goals; how near the ant came, after how many steps, whether it fell."""
     walks = []
     for start, goal in pairs:
@@ -84,11 +84,11 @@ def test_run(folder: pathlib.Path) -> dict[str, Any]:
     far = [(None, farthest_cell(geometry))] * N_FAR
     floor = [(None, geometry.sample_free(rng, 0.0)) for _ in range(N_PAIRS)]
     walks = {kind: walk(agent, env, pairs) for kind, pairs in (("pairs", drawn), ("far", far), ("floor", floor))}
-    last = np.arange(max(agent.store.oldest, agent.store.total - N_LAST), agent.store.total)
-    agent.planning = False
-    walks["straight"] = walk(agent, env, drawn)
+    store = agent.parts.store
+    last = np.arange(max(store.oldest, store.total - N_LAST), store.total)
+    walks["straight"] = walk(StraightOn(agent), env, drawn)
     visits = {
-        "agent": visited_share(geometry, agent.store.column("next_achieved_goal", last)),
+        "agent": visited_share(geometry, store.column("next_achieved_goal", last)),
         "random walk": visited_share(
             geometry, random_walk(gym.make(config["env_id"], **config["env_kwargs"]), config["seed"], N_LAST)
         ),

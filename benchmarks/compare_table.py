@@ -27,8 +27,7 @@ ORDER = [
     ("dsg-frontier", "ddpg-her"),
     ("dsg-frontier", "td3-her-recipe"),
     ("dsg-frontier", "td3-her-recipe-body"),
-    ("dsg-frontier", "global-option"),
-    ("dsg-frontier", "global-option-ways"),
+    ("dsg-frontier", "straight-on"),
     ("dco-10", "random-walk"),
 ]
 

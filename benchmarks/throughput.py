@@ -1,11 +1,12 @@
 """
-What one environment step of ``learn()`` costs: ``SkillGraphAgent`` with a live graph against SB3's DDPG.
+What one environment step of ``learn()`` costs: ``SkillGraphAgent`` against SB3's DDPG.
 
 Both learn in one process on one thread, on environments of their own, with the same networks, the same minibatch and
-one update per environment step: after every step, or eight of them after every eighth. They take turns, so that what
-else the machine does hits both alike. Medians are over the turns. The breakdown: *simulation* is the environment's
+one update per environment step: after every step, or eight of them after every eighth. They take turns, after a warm-up
+in which both learn and the agent finds the events of its graph, so that what else the machine does hits both alike.
+Medians are over the turns. The breakdown: *simulation* is the environment's
 ``step`` as ``gym.make`` returns it, *update* is ``train`` (sampling included), *rest* is all else: roll-out loop,
-choosing and ending options, the graph, the store.
+plans, the ends of options, the graph, the store.
 
 Run it with ``OMP_NUM_THREADS=1 python -m benchmarks.throughput --out benchmarks/results/throughput.json``.
 """
@@ -19,16 +20,14 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import gymnasium as gym
-import numpy as np
 import torch as th
 from stable_baselines3 import DDPG
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_skillgraph import SkillGraphAgent
-from sb3_skillgraph.events import Event
 
 ENVS = {"point": "SkillGraph/PointMazeMedium-v0", "ant": "SkillGraph/AntUMaze-v0"}
-WARM_UP = 3_000  # random steps, in whose trajectories the graph is laid
+RANDOM_STEPS = 1_000  # at the start, without learning
 PARTS = ("simulation", "update", "rest")
 
 
@@ -89,37 +88,10 @@ class Stopwatch:
         return {part: 1e3 * seconds / n_steps for part, seconds in (*self.seconds.items(), ("total", total))}
 
 
-def populate(agent: SkillGraphAgent, n_options: int) -> None:
-    """
-    Lay a graph of mature options along trajectories: from event to event, as if something else had shown the ways.
-
-    :param agent: one that has taken its warm-up steps
-    :param n_options: number of options
-    """
-    visited, stretch = agent.visited, 12
-    for start in np.linspace(0, visited.size - stretch - 1, 50 * n_options).astype(int):
-        path = visited.points[start : start + stretch].astype(np.float64)
-        source, target = (agent.planner.event_at(point) or add_event(agent, point) for point in (path[0], path[-1]))
-        if source is not target and f"{source.id}>{target.id}" not in agent.chaining.chains:
-            chain = agent.chaining.open_chain(source, target)
-            agent.chaining.learn_success(agent.chaining.options[chain.options[0]], path[:-1], path[-1])
-        if len(agent.graph.options) == n_options:
-            return
-    raise RuntimeError(f"The warm-up's trajectories gave only {len(agent.graph.options)} options: lengthen it.")
-
-
-def add_event(agent: SkillGraphAgent, point: np.ndarray) -> Event:
-    """Add an event where none is yet."""
-    added = agent.discovery.add(point)
-    events = list(agent.graph.events.values())
-    agent.visited.set_events(np.stack([event.center for event in events]), np.array([event.radius for event in events]))
-    return added
-
-
-def build(case: Case, n_options: int) -> tuple[Stopwatch, Stopwatch]:
+def build(case: Case, warm_up: int) -> tuple[Stopwatch, Stopwatch]:
     """
     :param case: what to measure
-    :param n_options: options in the graph
+    :param warm_up: environment steps of both before anything is measured
     :return: SB3's DDPG and our agent, both past their warm-up
     """
     common: dict[str, Any] = dict(
@@ -127,7 +99,7 @@ def build(case: Case, n_options: int) -> tuple[Stopwatch, Stopwatch]:
         batch_size=case.batch_size,
         train_freq=case.train_freq,
         gradient_steps=case.train_freq,
-        learning_starts=WARM_UP,
+        learning_starts=min(RANDOM_STEPS, warm_up),
         policy_kwargs={"net_arch": list(case.net_arch)},
         device="cpu",
     )
@@ -135,21 +107,20 @@ def build(case: Case, n_options: int) -> tuple[Stopwatch, Stopwatch]:
     stock = DDPG("MultiInputPolicy", envs[0], buffer_size=100_000, **common)
     agent = SkillGraphAgent("MultiInputPolicy", envs[1], buffer_size=100_000, **common)
     for model in (stock, agent):
-        model.learn(WARM_UP, log_interval=10**9)
-    populate(agent, n_options)
+        model.learn(warm_up, log_interval=10**9)
     return Stopwatch(stock, envs[0]), Stopwatch(agent, envs[1])
 
 
-def measure(case: Case, n_options: int, n_steps: int, n_turns: int) -> dict[str, Any]:
+def measure(case: Case, warm_up: int, n_steps: int, n_turns: int) -> dict[str, Any]:
     """
     :param case: what to measure
-    :param n_options: options in the graph
+    :param warm_up: environment steps of both before anything is measured
     :param n_steps: environment steps a turn
     :param n_turns: number of turns
     :return: ``sb3`` and ``ours`` (milliseconds per step by part), ``speedup`` (the median over turns of SB3's time over
-        ours), ``steps_per_second`` of both, ``options`` at the end
+        ours), ``steps_per_second`` of both, ``events`` and ``edges`` of the graph at the end
     """
-    stock, ours = build(case, n_options)
+    stock, ours = build(case, warm_up)
     turns = [[watch.learn(n_steps) for watch in (stock, ours)] for _ in range(n_turns + 1)][1:]
     parts = (*PARTS, "total")
     sb3_ms, ours_ms = ({part: round(statistics.median(turn[i][part] for turn in turns), 4) for part in parts} for i in (0, 1))
@@ -160,7 +131,8 @@ def measure(case: Case, n_options: int, n_steps: int, n_turns: int) -> dict[str,
         "ours": ours_ms,
         "speedup": round(statistics.median(a["total"] / b["total"] for a, b in turns), 3),
         "steps_per_second": {"sb3": round(1e3 / sb3_ms["total"]), "ours": round(1e3 / ours_ms["total"])},
-        "options": len(agent.graph.options),
+        "events": len(agent.events),
+        "edges": agent.graph.edges.size,
     }
 
 
@@ -180,7 +152,7 @@ def verdict(case: Case, row: dict[str, Any]) -> str:
 def main() -> None:
     """Print the table, and write it where ``--out`` says."""
     parser = argparse.ArgumentParser(description="Time learn() against SB3's.")
-    parser.add_argument("--options", type=int, default=20, help="options in the graph")
+    parser.add_argument("--warm-up", type=int, default=3_000, help="environment steps before the first turn")
     parser.add_argument("--steps", type=int, default=256, help="environment steps a turn")
     parser.add_argument("--turns", type=int, default=20, help="turns of each")
     parser.add_argument("--out", type=Path, help="JSON file for the results")
@@ -190,7 +162,7 @@ def main() -> None:
     print("milliseconds per environment step: simulation + update + rest = total")
     print(f"{'case':<34}{'SB3':>34}{'ours':>34}{'speedup':>9}")
     for case in CASES:
-        row = measure(case, arguments.options, arguments.steps, arguments.turns)
+        row = measure(case, arguments.warm_up, arguments.steps, arguments.turns)
         name = f"{case.env} {'-'.join(map(str, case.net_arch))} B={case.batch_size} every {case.train_freq}"
         columns = [
             " + ".join(f"{times[part]:.2f}" for part in PARTS) + f" = {times['total']:.2f}"

@@ -2,8 +2,8 @@
 What one gradient step costs: ``OptionDDPG`` and ``OptionTD3`` against SB3's DDPG and TD3.
 
 Both learn in one process on one thread and take turns, so that what else the machine does hits both alike; medians
-are over the turns. Beside them the time that the update's matrix products alone take, each by the fastest library
-at hand: no update without other arithmetic can be faster. On a GPU (``--device cuda``) there is no such column: there
+are over the turns. Beside them the time that the update's matrix products alone take, each in the fastest layout
+of torch's: no update without other arithmetic can be faster. On a GPU (``--device cuda``) there is no such column: there
 an update costs what it takes to start its kernels.
 
 Run it with ``OMP_NUM_THREADS=1 python -m benchmarks.update --out benchmarks/results/update.json``.
@@ -26,7 +26,6 @@ from gymnasium import spaces
 from stable_baselines3 import DDPG, TD3
 from stable_baselines3.common.logger import Logger
 
-from sb3_skillgraph.options.fast_update import onednn_linear
 from sb3_skillgraph.options.learner import OptionDDPG, OptionTD3
 
 SHAPES = {"point": (6, 2), "ant": (31, 8)}
@@ -133,10 +132,6 @@ def fastest_product(shape: tuple[int, int, int], repeats: int) -> float:
         lambda: th.mm(transposed.t(), right, out=out),
         lambda: th.mm(columns, left.t()),
     ]
-    onednn = onednn_linear()
-    if onednn is not None:
-        ways.append(lambda: onednn(left, columns, None, "none", [], ""))
-        ways.append(lambda: onednn(left, right.t(), None, "none", [], ""))
     with th.inference_mode():
         return min(statistics.median(timed(way, repeats)) for way in ways)
 

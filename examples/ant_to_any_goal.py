@@ -54,12 +54,12 @@ def set_goal(env: gym.Env, observation: dict[str, Any], goal: np.ndarray) -> dic
 def walk(agent: SkillGraphAgent, env: gym.Env, observation: dict[str, Any], film: Film) -> tuple[Trajectory, Any, bool]:
     """Go to the goal; return the way there, the last observation, and whether the ant fell on its back."""
     task: Any = env.unwrapped
-    points, options = [observation["achieved_goal"]], []
+    points, options = [observation["achieved_goal"]], list[str]()
     state: Any = None
     over = False
     while not over:
         action, state = agent.predict(observation, state=state, deterministic=True)
-        options.append(int(state[0][0]))
+        options += agent.running(state)
         observation, _, terminated, truncated, info = env.step(action)
         points.append(observation["achieved_goal"])
         if len(options) % EVERY == 0:
@@ -67,7 +67,7 @@ def walk(agent: SkillGraphAgent, env: gym.Env, observation: dict[str, Any], film
         fell = bool(info.get("stuck"))
         over = terminated or truncated or fell
     goal = observation["desired_goal"]
-    return Trajectory(np.stack(points), np.array(options), goal, bool(info["is_success"])), observation, fell
+    return Trajectory(np.stack(points), options, goal, bool(info["is_success"])), observation, fell
 
 
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)

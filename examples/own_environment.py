@@ -18,7 +18,7 @@ from sb3_skillgraph import SkillGraphAgent
 class WindowCube(gym.Env[dict[str, np.ndarray], np.ndarray]):
     """A point in the cube [-1, 1]^3; the plane x = 0 is a wall with a window of half side 0.5."""
 
-    #: The agent takes the radius of its salient events from here (or from its argument ``event_radius``).
+    #: The agent takes the radius of its events from here (or from its argument ``event_radius``).
     distance_threshold = 0.3
 
     def __init__(self) -> None:
@@ -80,5 +80,5 @@ if __name__ == "__main__":
     agent = SkillGraphAgent("MultiInputPolicy", WindowCube(), seed=0)
     agent.learn(args.steps)
     summary = agent.graph_summary()
-    print(f"{summary['events']} salient events, {summary['options']} options, {summary['edges']} edges")
+    print(f"{summary['events']} events, {summary['salient_events']} of them salient; {summary['edges']} edges")
     print(f"success rate: {success_rate(agent, WindowCube(), n_episodes=50):.2f}")

@@ -28,14 +28,14 @@ agent.save(args.out / "agent.zip")
 agent = SkillGraphAgent.load(args.out / "agent.zip", env=env)
 observation, info = env.reset(seed=1)
 plan = agent.plan(observation)
-print(f"goal {observation['desired_goal']}: {plan.status}, by way of {' > '.join(plan.path) or 'no vertex of the graph'}")
+print(f"goal {observation['desired_goal']}: {plan}")
 
 # Act as with any SB3 model; the state holds the running option, so pass it back in.
 state, done = None, False
 while not done:
     action, state = agent.predict(observation, state=state, deterministic=True)
     observation, reward, terminated, truncated, info = env.step(action)
-    done = terminated or truncated or info["success"]
+    done = terminated or truncated or info["is_success"]
 print("reached the goal" if info["is_success"] else "did not reach the goal: train for longer")
 
 # Look at what it has learned.

@@ -54,7 +54,8 @@ class SkillGraphAgent(OffPolicyAlgorithm):
     :param gamma: discount factor
     :param train_freq: environment steps between updates
     :param gradient_steps: minibatch updates per ``train_freq`` steps
-    :param action_noise: SB3 action noise, or the standard deviation of Gaussian noise, in units of the scaled action
+    :param action_noise: SB3 action noise, or the standard deviation of Gaussian noise, in units of the scaled action;
+        None for none
     :param stats_window_size: episodes over which SB3's rollout statistics are averaged
     :param tensorboard_log: folder of the TensorBoard log
     :param policy_kwargs: keyword arguments of the walker's policy; ``net_arch`` is ``[128, 128]`` unless given
@@ -99,7 +100,7 @@ class SkillGraphAgent(OffPolicyAlgorithm):
         gamma: float = 0.98,
         train_freq: int | tuple[int, str] = 2,
         gradient_steps: int = 1,
-        action_noise: ActionNoise | float = 0.1,
+        action_noise: ActionNoise | float | None = 0.1,
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
         policy_kwargs: dict[str, Any] | None = None,
@@ -359,11 +360,7 @@ class SkillGraphAgent(OffPolicyAlgorithm):
         """
         Act as :meth:`predict` does, and tell which options have ended.
 
-        :param observation: one Dict observation, or a batch with a leading axis
-        :param state: what the last call returned
-        :param episode_start: where an episode begins, and the state is forgotten; shape ``(n_envs,)``
         :return: actions in the environment's own bounds, the state, and one run for each option that has ended
-        :raises ValueError: if the observation does not fit the observation space
         """
         batch, vectorized = as_batch(observation, self.observation_space)
         running = self._running_state(len(batch["achieved_goal"]), state)
@@ -443,41 +440,31 @@ class SkillGraphAgent(OffPolicyAlgorithm):
         return self.parts.walker.learner._get_torch_save_params()
 
     def get_parameters(self) -> dict[str, Any]:
-        """
-        Return the parameters of the walker's networks and optimisers, under SB3's names.
-
-        :return: state dicts by name: ``"policy"``, ``"actor.optimizer"``, ...; tensors that belong to no network (SAC's
-            entropy coefficient) as SB3 names them
-        """
-        return self.parts.walker.learner.get_parameters()
+        """Return the parameters of the walker's networks and optimisers: state dicts under SB3's names."""
+        return persistence.parameters(self.parts.walker.learner)
 
     def set_parameters(
         self, load_path_or_dict: str | dict[str, Any], exact_match: bool = True, device: th.device | str = "auto"
     ) -> None:
         """
-        Set the parameters of the walker's networks and optimisers.
+        Set the parameters of the walker's networks and optimisers; arguments as SB3 has them.
 
-        :param load_path_or_dict: what :meth:`get_parameters` returned, or the path of a saved agent
-        :param exact_match: whether every parameter must be given
-        :param device: torch device on which a file is loaded
         :raises ValueError: if a name is unknown, or missing although ``exact_match``; if a file cannot be read
         :raises RuntimeError: if the tensors do not fit
         """
-        given = load_path_or_dict
-        if not isinstance(given, dict):
-            given = load_tree(given, "agent")["parameters"]
-        self.parts.walker.learner.set_parameters(given, exact_match, device)
+        learner = self.parts.walker.learner
+        if isinstance(load_path_or_dict, dict):
+            persistence.set_parameters(learner, load_path_or_dict, exact_match, device)
+        else:
+            persistence.load_parameters(learner, load_tree(load_path_or_dict, "agent"), exact_match, device)
 
     def save(self, path: PathOrFile, exclude: Iterable[str] | None = None, include: Iterable[str] | None = None) -> None:
         """
-        Save everything but the replay buffer to one zip of JSON and ``.npy`` members.
+        Save everything but the replay buffer to one zip of JSON and ``.npy`` members; arguments as SB3 has them.
 
         The environments' states are saved too, if they can tell them (``get_state``), so that learning can go on
-        exactly where it was.
+        exactly where it was. Constructor arguments that are excluded take their defaults when the file is loaded.
 
-        :param path: path (``.zip`` is added if it has no ending) or binary file object
-        :param exclude: names of constructor arguments not to save; loading then takes their defaults
-        :param include: names to save even if excluded
         :raises OSError: if the file cannot be written; an old file of that name is then untouched
         """
         save_tree(path, "agent", persistence.agent_tree(self, set(exclude or ()) - set(include or ())))
@@ -486,20 +473,17 @@ class SkillGraphAgent(OffPolicyAlgorithm):
         """
         Save the filled rows of the replay buffer.
 
-        :param path: path (``.zip`` is added if it has no ending) or binary file object
         :raises OSError: if the file cannot be written; an old file of that name is then untouched
         """
         save_tree(path, "replay_buffer", self.parts.store.get_state())
 
     def load_replay_buffer(self, path: PathOrFile, truncate_last_traj: bool = True) -> None:
         """
-        Load what :meth:`save_replay_buffer` saved.
+        Load what :meth:`save_replay_buffer` saved. (Trajectories are kept apart whatever follows.)
 
-        :param path: path or binary file object
-        :param truncate_last_traj: not used: trajectories are kept apart whatever follows
         :raises ValueError: if the file is damaged or holds something else, or does not fit this agent
         """
-        self.parts.store.set_state(load_tree(path, "replay_buffer"))
+        persistence.restore_store(self.parts.store, load_tree(path, "replay_buffer"))
 
     @classmethod
     def load(
@@ -513,17 +497,11 @@ class SkillGraphAgent(OffPolicyAlgorithm):
         **kwargs: Any,
     ) -> SelfSkillGraphAgent:
         """
-        Load an agent; nothing in the file is ever executed.
+        Load an agent; nothing in the file is ever executed. Arguments as SB3 has them.
 
-        :param path: path (with or without ``.zip``) or binary file object
-        :param env: environment to go on with; None to only predict
-        :param device: torch device
-        :param custom_objects: arguments to use in place of the saved ones
-        :param print_system_info: print the versions of this system's libraries
+        :param custom_objects: arguments to use in place of the saved ones, as ``kwargs`` are
         :param force_reset: begin ``learn`` at a fresh episode even if the environments' states were saved (SB3's default
             is to do so; here learning goes on exactly where it was)
-        :param kwargs: arguments to use in place of the saved ones
-        :return: the agent
         :raises ValueError: if the file is damaged, of another schema or no agent at all; if the environment does not fit;
             if the agent was made with a function that must be given again
         :raises TypeError: if there is no such argument
@@ -533,21 +511,14 @@ class SkillGraphAgent(OffPolicyAlgorithm):
         return persistence.load(cls, path, env, device, {**(custom_objects or {}), **kwargs}, force_reset)
 
     def copy(self: SelfSkillGraphAgent, env: GymEnv) -> SelfSkillGraphAgent:
-        """
-        Copy the agent, replay buffer included; what the copy learns leaves this one as it is.
-
-        :param env: environment of the copy
-        :return: the copy
-        """
+        """Return a copy with an environment of its own, replay buffer included; what it learns leaves this one as it is."""
         return persistence.copy(self, env)
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         """
         Give the agent another environment with the same spaces and the same number of copies.
 
-        :param env: the environment
-        :param force_reset: whether ``learn`` begins at a fresh episode; False to go on, after ``load``, where the saved
-            environments were
+        :param force_reset: whether ``learn`` begins at a fresh episode; False to go on where the saved environments were
         :raises ValueError: if the environment does not fit, or is normalised by VecNormalize
         """
         refuse_vec_normalize(env)

@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 from stable_baselines3 import DDPG, SAC, TD3
-from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
@@ -100,7 +99,7 @@ class Parts:
             missions,
             witness,
             store,
-            0.0 if isinstance(noise, ActionNoise) else noise,
+            noise if isinstance(noise, int | float) else 0.0,
             arguments["random_action_prob"],
             rng,
         )
@@ -134,21 +133,24 @@ def option_class(given: type[OffPolicyAlgorithm] | str) -> type[OffPolicyAlgorit
 
 
 _RANGES: dict[str, tuple[float, float]] = {
-    "learning_starts": (0, np.inf),
-    "buffer_size": (1, np.inf),
-    "batch_size": (1, np.inf),
     "tau": (0, 1),
     "gamma": (0, 1),
-    "gradient_steps": (-1, np.inf),
-    "max_events": (8, np.inf),
-    "walk_steps": (1, np.inf),
-    "action_noise": (0, np.inf),
-    "exploration_steps": (1, np.inf),
-    "explore_beyond": (0, np.inf),
+    "action_noise": (0, 1e6),
+    "explore_beyond": (0, 1e6),
     "random_action_prob": (0, 1),
     "hindsight": (0, 1),
     "goal_tolerance": (1e-6, 1),
-    "shaping": (0, np.inf),
+    "shaping": (0, 1e6),
+}
+_WHOLE: dict[str, tuple[int, int]] = {
+    "learning_starts": (0, 2**62),
+    "buffer_size": (1, 2**62),
+    "batch_size": (1, 2**62),
+    "gradient_steps": (-1, 2**62),
+    "stats_window_size": (1, 2**62),
+    "max_events": (8, 2**62),
+    "walk_steps": (1, 2**62),
+    "exploration_steps": (1, 2**62),
 }
 
 
@@ -158,12 +160,17 @@ def check_numbers(arguments: dict[str, Any]) -> None:
     :param arguments: the agent's keyword arguments
     :raises ValueError: naming the argument and its range
     """
-    for name, (low, high) in _RANGES.items():
-        value = arguments[name]
-        if isinstance(value, ActionNoise):
-            continue
-        if isinstance(value, bool) or not isinstance(value, int | float | np.number) or not low <= value <= high:
-            raise ValueError(f"{name} must be a number from {low:g} to {high:g}, not {value!r}.")
+    noise, train_freq = arguments["action_noise"], arguments["train_freq"]
+    given = {**arguments, "action_noise": noise if isinstance(noise, int | float | str) else 0.0}
+    for ranges, kinds, what in ((_RANGES, (int, float, np.number), "a number"), (_WHOLE, (int, np.integer), "a whole number")):
+        for name, (low, high) in ranges.items():
+            value = given[name]
+            if isinstance(value, bool) or not isinstance(value, kinds) or not low <= value <= high:
+                upper = f"to {high:g}" if high < 1e6 else "on"
+                raise ValueError(f"{name} must be {what} from {low:g} {upper}, not {value!r}.")
+    frequency = train_freq[0] if isinstance(train_freq, tuple) else train_freq
+    if isinstance(frequency, int) and frequency < 1:
+        raise ValueError(f"train_freq must be 1 at least, not {train_freq!r}.")
 
 
 def _box(space: spaces.Space) -> spaces.Box:

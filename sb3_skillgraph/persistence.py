@@ -4,6 +4,8 @@ import io
 import random
 from collections import deque
 from collections.abc import Iterable
+from copy import deepcopy
+from inspect import signature
 from typing import Any
 
 import numpy as np
@@ -11,15 +13,20 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.noise import VectorizedActionNoise
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.save_util import recursive_getattr
 from stable_baselines3.common.utils import check_for_correct_spaces
 
 from sb3_skillgraph.goal_env import refuse_vec_normalize
+from sb3_skillgraph.memory.replay import TransitionStore
 from sb3_skillgraph.options.learner import OptionDDPG, OptionTD3
 from sb3_skillgraph.saving import MissingCallable, PathOrFile, known_class, load_tree
 
 for _option_class in (OptionDDPG, OptionTD3):
     known_class(_option_class)
 
+#: What building and filling an agent raises if it is given something else than was saved.
+UNFIT = (AssertionError, AttributeError, IndexError, KeyError, MemoryError, OverflowError, RuntimeError, TypeError)
 _COUNTERS = ("num_timesteps", "_total_timesteps", "_num_timesteps_at_start", "_episode_num", "_n_updates")
 
 
@@ -44,9 +51,9 @@ def agent_tree(agent: Any, left_out: Iterable[str]) -> dict[str, Any]:
 
 
 def _arguments(agent: Any) -> dict[str, Any]:
-    """Return the constructor's arguments as they are now: SB3's are attributes, which a user may have set."""
+    """Return the constructor's arguments; those of SB3 that are read from attributes while learning as they are now."""
     arguments = dict(agent._arguments)
-    for name in ("batch_size", "buffer_size", "gamma", "gradient_steps", "learning_starts", "tau", "verbose"):
+    for name in ("batch_size", "gradient_steps", "learning_starts", "verbose"):
         arguments[name] = getattr(agent, name)
     arguments["event_radius"] = agent.event_radius
     if agent.action_noise is not None:
@@ -103,6 +110,18 @@ def load(cls: Any, path: PathOrFile, env: Any, device: Any, given: dict[str, Any
     :raises TypeError: if there is no such argument
     """
     tree = load_tree(path, "agent")
+    unknown = set(given) - set(signature(cls.__init__).parameters)
+    if unknown:
+        raise TypeError(f"{cls.__name__} has no argument {sorted(unknown)[0]!r}.")
+    try:
+        return _build(cls, tree, env, device, given, force_reset)
+    except UNFIT as error:
+        raise ValueError(
+            f"The file was written by another version of sb3_skillgraph, or for another option_class ({error!r})."
+        ) from error
+
+
+def _build(cls: Any, tree: dict[str, Any], env: Any, device: Any, given: dict[str, Any], force_reset: bool) -> Any:
     arguments = {"policy": "MultiInputPolicy", **tree["arguments"], "device": device, **given}
     require_callables(arguments)
     agent = cls(env=None, _init_setup_model=False, **arguments)
@@ -118,7 +137,7 @@ def load(cls: Any, path: PathOrFile, env: Any, device: Any, given: dict[str, Any
     if isinstance(noise, VectorizedActionNoise) and noise.n_envs != agent.n_envs:
         agent.action_noise = noise.base_noise
     agent._setup_model()
-    restore(agent, tree, same_envs=agent.n_envs == tree["n_envs"] and not force_reset)
+    _restore(agent, tree, same_envs=agent.n_envs == tree["n_envs"] and not force_reset)
     agent._loaded = True
     return agent
 
@@ -139,23 +158,8 @@ def copy(agent: Any, env: Any) -> Any:
     return twin
 
 
-def restore(agent: Any, tree: dict[str, Any], same_envs: bool) -> None:
-    """Give a new agent what another one has learned.
-
-    :param agent: a :class:`~sb3_skillgraph.SkillGraphAgent` with the same arguments
-    :param tree: what :func:`agent_tree` returned
-    :param same_envs: whether its environments go on where the others were
-    :raises ValueError: if the tree is of another version
-    """
-    try:
-        _restore(agent, tree, same_envs)
-    except (AttributeError, IndexError, KeyError, TypeError) as error:
-        raise ValueError(
-            f"The file was written by another version of sb3_skillgraph, or for another option_class ({error!r})."
-        ) from error
-
-
 def _restore(agent: Any, tree: dict[str, Any], same_envs: bool) -> None:
+    """Give a new agent what another one has learned."""
     parts = agent.parts
     parts.planner.horizon = tree["horizon"]
     parts.walker.learner._n_updates = tree["walker"]
@@ -202,18 +206,83 @@ def restore_env(agent: Any) -> bool:
     return True
 
 
-def require_callables(arguments: dict[str, Any]) -> None:
+def parameters(learner: OffPolicyAlgorithm) -> dict[str, Any]:
+    """Return a model's state dicts by SB3's names, and under ``"variables"`` its tensors that belong to no network.
+
+    :param learner: an SB3 model
+    """
+    names = learner._get_torch_save_params()[1]
+    variables = {name: recursive_getattr(learner, name).data for name in names}
+    return {**learner.get_parameters(), **({"variables": variables} if variables else {})}
+
+
+def set_parameters(learner: OffPolicyAlgorithm, given: dict[str, Any], exact_match: bool, device: Any) -> None:
+    """Set what :func:`parameters` returned.
+
+    :param learner: an SB3 model
+    :param given: the parameters
+    :param exact_match: whether every parameter must be given
+    :param device: torch device
+    """
+    given = dict(given)
+    for name, tensor in given.pop("variables", {}).items():
+        recursive_getattr(learner, name).data.copy_(tensor)
+    learner.set_parameters(given, exact_match, device)
+
+
+def load_parameters(learner: OffPolicyAlgorithm, tree: dict[str, Any], exact_match: bool, device: Any) -> None:
+    """Set the parameters that a saved agent has; all of them, or none.
+
+    :param learner: an SB3 model
+    :param tree: what :func:`agent_tree` returned
+    :param exact_match: whether every parameter must be given
+    :param device: torch device
+    :raises ValueError: if they do not fit
+    """
+    before = deepcopy(parameters(learner))
+    try:
+        set_parameters(learner, tree["parameters"], exact_match, device)
+    except UNFIT as error:
+        set_parameters(learner, before, True, device)
+        raise ValueError(f"The parameters in the file do not fit this agent ({error!r}).") from error
+
+
+def restore_store(store: TransitionStore, state: dict[str, Any]) -> None:
+    """Give a store the rows of a file; all of them, or none.
+
+    :param store: the store
+    :param state: what its ``get_state`` returned
+    :raises ValueError: if they do not fit
+    """
+    before = store.get_state()
+    try:
+        store.set_state(state)
+    except UNFIT as error:
+        store.set_state(before)
+        raise ValueError(f"The rows in the file do not fit this agent ({error!r}).") from error
+    except ValueError:
+        store.set_state(before)
+        raise
+
+
+def require_callables(arguments: Any, name: str = "") -> None:
     """Ask for what is stored by name only.
 
     :param arguments: of the constructor, as they were loaded
+    :param name: of the argument that they belong to
     :raises ValueError: naming the argument
     """
-    for name, value in arguments.items():
-        if isinstance(value, MissingCallable):
-            raise ValueError(
-                f"The agent was made with {name}={value.name}, which is stored by name only, since loading must not run "
-                f"code from a file: give it again, load(..., {name}=...)."
-            )
+    if isinstance(arguments, MissingCallable):
+        raise ValueError(
+            f"The agent was made with {name}={arguments.name}, which is stored by name only, since loading must not run "
+            f"code from a file: give it again, load(..., {name}=...)."
+        )
+    if isinstance(arguments, dict):
+        for key, value in arguments.items():
+            require_callables(value, name or str(key))
+    elif isinstance(arguments, list | tuple):
+        for value in arguments:
+            require_callables(value, name)
 
 
 def describe_space(space: spaces.Space) -> dict[str, Any]:

@@ -262,7 +262,7 @@ class Planner:
         curve = np.mean([self._arrival(policy, opinion, solution, remaining) for opinion in OPINIONS], axis=0)
         probability = float(curve[-1])
         if probability < LEAST:
-            return LEAST, float(np.minimum(solution.values[solution.start], self.lost))
+            return LEAST, float(solution.episode_costs[first])
         steps = float(((np.arange(1, TIME_BINS + 1) - 0.5) * np.diff(curve)).sum() / probability)
         return min(probability, 1.0), steps * remaining / TIME_BINS
 

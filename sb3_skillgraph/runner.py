@@ -132,7 +132,9 @@ class Runner:
                 continue
             lost = stuck is not None and bool(stuck[i])
             arrived = not lost and math.dist(points[i].tolist(), state.aim[i].tolist()) <= self.graph.radius
-            if arrived or lost or state.steps[i] >= state.timeout[i]:
+            # Its event may have been merged with others since.
+            gone = option != DIRECT and self.graph.index(option) == NOWHERE
+            if arrived or lost or gone or state.steps[i] >= state.timeout[i]:
                 runs.append(self._run(state, i, points[i], arrived, lost))
         if runs:
             state = state.copy()

@@ -7,7 +7,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from conftest import TOY
+from conftest import TOY, new_agent
 from stable_baselines3 import DDPG, HerReplayBuffer
 from stable_baselines3.common.buffers import DictReplayBuffer
 
@@ -19,6 +19,7 @@ from sb3_skillgraph.baselines import (
     NewGoals,
     OptionTask,
     RandomWalk,
+    StraightOn,
     make_her,
     make_uvfa,
 )
@@ -27,6 +28,8 @@ from sb3_skillgraph.options.learner import OptionTD3
 from sb3_skillgraph.options.option import goal_rule
 
 CORRIDOR = [[1] * 6, [1, "r", 0, 0, 0, 1], [1] * 6]
+SHORT_CORRIDOR: dict[str, Any] = {"maze_map": CORRIDOR, "max_steps": 60}
+SMALL_NETS: dict[str, Any] = dict(policy_kwargs={"net_arch": [32, 32]}, batch_size=64, learning_rate=2e-3)
 
 
 def toy(**kwargs: object) -> gym.Env:
@@ -55,14 +58,14 @@ def test_the_goal_conditioned_baselines_are_sb3s_own() -> None:
     assert isinstance(her.replay_buffer, HerReplayBuffer)
     assert her.batch_size == 64
     for model in (uvfa, her):
-        model.learn(1_200)
-        assert model._n_updates > 50
+        model.learn(1_100)
+        assert model._n_updates > 20
 
 
 def test_hindsight_reaches_goals() -> None:
-    model = make_her(toy(), seed=0, learning_starts=300, train_freq=(1, "step"))
-    model.learn(3_000)
-    assert evaluate_pairs(model, TOY, n_pairs=30).success_rate >= 0.4  # 0.7 in most seeds, a random walk 0.1
+    env = AnyStart(toy(maze_map=CORRIDOR, max_steps=60))
+    model = make_her(env, seed=0, learning_starts=200, train_freq=(1, "step"), **SMALL_NETS).learn(600)
+    assert evaluate_pairs(model, TOY, env_kwargs=SHORT_CORRIDOR, n_pairs=40).success_rate >= 0.6  # a random walk: below 0.2
 
 
 class Sinks(gym.Wrapper):
@@ -96,20 +99,21 @@ def test_a_baseline_is_paid_as_options_are_paid() -> None:
 
 
 def test_uvfa_learns_where_chance_finds_goals() -> None:
-    model = make_uvfa(AnyStart(toy(maze_map=CORRIDOR)), seed=1, goal_freq=1, learning_starts=200).learn(4_000)
-    corridor = {"maze_map": CORRIDOR, "max_steps": 60}
-    assert evaluate_pairs(model, TOY, env_kwargs=corridor, n_pairs=40).success_rate >= 0.35  # a random walk: below 0.1
+    env = AnyStart(toy(maze_map=CORRIDOR))
+    model = make_uvfa(env, seed=2, goal_freq=1, learning_starts=200, **SMALL_NETS).learn(2_000)
+    assert evaluate_pairs(model, TOY, env_kwargs=SHORT_CORRIDOR, n_pairs=40).success_rate >= 0.35  # a random walk: below 0.2
 
 
 def test_the_recipe_learns_without_a_graph() -> None:
     seen: list[int] = []
-    recipe = HindsightRecipe(toy(), seed=0, learning_starts=300, batch_size=64).learn(4_000, seen.append)
+    recipe = HindsightRecipe(toy(), seed=0, learning_starts=300, batch_size=64).learn(3_000, seen.append)
     agent = recipe.agent
-    assert seen == list(range(1, 4_001))
-    assert agent.store.total == 4_000
-    assert agent.global_option.learner._n_updates == (4_000 - 300) // 2
-    assert not agent.planning and not agent.events
-    assert evaluate_pairs(agent, TOY, n_pairs=30).success_rate >= 0.4
+    assert seen == list(range(1, 3_001))
+    assert agent.parts.store.total == 3_000
+    assert agent.parts.walker.learner._n_updates == agent._n_updates == (3_000 - 300) // 2
+    assert not agent.events and agent.graph.edges.size == 0
+    assert isinstance(recipe.policy, StraightOn) and recipe.policy.agent is agent
+    assert evaluate_pairs(recipe.policy, TOY, n_pairs=30, env_kwargs={"max_steps": 150}).success_rate >= 0.4
 
 
 class Pits(gym.Wrapper):
@@ -126,16 +130,16 @@ class Pits(gym.Wrapper):
 
 
 def test_the_recipe_ends_episodes_at_goals_and_falls_but_knows_them_apart() -> None:
-    store = HindsightRecipe(toy(), seed=0, learning_starts=10_000).learn(1_000).agent.store
+    store = HindsightRecipe(toy(), seed=0, learning_starts=10_000).learn(1_000).agent.parts.store
     last = np.flatnonzero(np.diff(store._trajectory[:1_000]))
     distance = np.linalg.norm(store.column("next_achieved_goal", last) - store.column("goal", last), axis=1)
     assert (distance <= 0.45).sum() >= 3
     assert not store.terminated(np.arange(1_000)).any(), "an end at the episode's own goal is no end for another"
-    store = HindsightRecipe(Pits(toy()), seed=0, learning_starts=10_000).learn(40).agent.store
+    store = HindsightRecipe(Pits(toy()), seed=0, learning_starts=10_000).learn(40).agent.parts.store
     pits = np.flatnonzero(store.terminated(np.arange(40)))
     assert len(pits) >= 5
     assert not store.stuck(np.arange(40)).any()
-    store = HindsightRecipe(Sinks(toy()), seed=0, learning_starts=10_000).learn(30).agent.store
+    store = HindsightRecipe(Sinks(toy()), seed=0, learning_starts=10_000).learn(30).agent.parts.store
     falls = np.flatnonzero(store.stuck(np.arange(29)))
     assert len(falls) >= 5
     assert (np.diff(store._trajectory[:30])[falls] == 1).all()
@@ -164,7 +168,7 @@ def test_a_new_goal_is_pursued_where_the_last_one_was_reached_or_given_up() -> N
 
 def test_the_recipe_sees_no_end_where_its_goal_changes() -> None:
     env = NewGoals(toy(terminate_on_success=False), n_steps=20)
-    store = HindsightRecipe(env, seed=0, learning_starts=10_000).learn(400).agent.store
+    store = HindsightRecipe(env, seed=0, learning_starts=10_000).learn(400).agent.parts.store
     goals = store.column("goal", np.arange(399))
     assert len(np.unique(goals, axis=0)) >= 20
     max_steps = int(env.get_wrapper_attr("max_steps"))
@@ -172,30 +176,64 @@ def test_the_recipe_sees_no_end_where_its_goal_changes() -> None:
     assert not store.terminated(np.arange(400)).any()
 
 
-class Lazy(gym.Wrapper):
-    """Goes nowhere, whatever is done."""
+def test_the_recipe_does_what_its_walker_does_where_there_is_no_noise() -> None:
+    silent = dict(learning_starts=0, gradient_steps=0, action_noise=0.0, random_action_prob=0.0)
+    recipe = HindsightRecipe(toy(), seed=0, **silent).learn(30)
+    store, rows = recipe.agent.parts.store, np.arange(30)
+    seen = {name: store.column(name, rows) for name in ("observation", "achieved_goal")}
+    acted = recipe.policy.predict({**seen, "desired_goal": store.column("goal", rows)})[0]
+    np.testing.assert_allclose(store.column("action", rows), acted, atol=1e-5)
 
-    def step(self, action: np.ndarray) -> Any:
-        return self.env.step(np.zeros(2, dtype=np.float32))
+
+def test_the_recipe_explores_under_the_noise_of_the_agent() -> None:
+    recipe = HindsightRecipe(toy(), seed=0, learning_starts=100, gradient_steps=0, action_noise=0.2).learn(400)
+    store, rows = recipe.agent.parts.store, np.arange(400)
+    seen = {name: store.column(name, rows) for name in ("observation", "achieved_goal")}
+    acted = recipe.policy.predict({**seen, "desired_goal": store.column("goal", rows)})[0]
+    away = np.abs(store.column("action", rows) - acted).max(axis=1)
+    assert np.median(away[:100]) > 0.5  # at first actions are random
+    assert 0.05 < np.median(away[100:]) < 0.4
+    assert (away[100:] > 0.7).mean() > 0.02  # and now and then later
 
 
-def test_the_recipe_is_shaken_loose_where_it_stands_still() -> None:
-    silent = dict(learning_starts=0, gradient_steps=0, exploration_noise=0.0, random_action_prob=0.0)
-    recipe = HindsightRecipe(Lazy(toy()), seed=0, stall_steps=15, **silent).learn(30)
-    actions = recipe.agent.store.column("action", np.arange(30))
-    changes = np.flatnonzero(np.abs(np.diff(actions, axis=0)).max(axis=1) > 1e-6)
-    assert changes.tolist() in ([14, 24], [15, 25])
+def test_the_recipe_wants_updates_between_steps() -> None:
+    with pytest.raises(ValueError, match="train_freq must be a number of steps"):
+        HindsightRecipe(toy(), seed=0, train_freq=(1, "episode"))
 
 
 def test_a_copy_of_the_recipe_leaves_the_recipe_alone() -> None:
     recipe = HindsightRecipe(toy(), seed=0, learning_starts=100, batch_size=16).learn(200)
-    before = recipe.agent.predict(toy().reset(seed=3)[0])[0]
+    seen = toy().reset(seed=3)[0]
+    before = recipe.policy.predict(seen)[0]
     twin = recipe.copy(toy())
-    np.testing.assert_array_equal(twin.agent.predict(toy().reset(seed=3)[0])[0], before)
+    np.testing.assert_array_equal(twin.policy.predict(seen)[0], before)
     twin.learn(200)
-    assert twin.agent.store.total == 400 and not twin.agent.planning
-    assert recipe.agent.store.total == 200
-    np.testing.assert_array_equal(recipe.agent.predict(toy().reset(seed=3)[0])[0], before)
+    assert twin.agent.parts.store.total == 400
+    assert recipe.agent.parts.store.total == 200
+    assert not np.array_equal(twin.policy.predict(seen)[0], before)
+    np.testing.assert_array_equal(recipe.policy.predict(seen)[0], before)
+
+
+def test_straight_on_goes_where_the_walker_goes_whatever_the_graph_says(trained: Any) -> None:
+    straight, rng = StraightOn(trained), np.random.default_rng(0)
+    points, goals = (np.float32(rng.uniform(-1.5, 1.5, (8, 2))) for _ in range(2))
+    batch = {"observation": points, "achieved_goal": points, "desired_goal": goals}
+    actions, state = straight.predict(batch)
+    assert state is None and actions.shape == (8, 2)
+    np.testing.assert_array_equal(actions, trained.parts.walk(batch, goals))
+    for i in range(8):
+        one = straight.predict({key: value[i] for key, value in batch.items()})[0]
+        np.testing.assert_allclose(one, actions[i], atol=1e-6)
+    planned = np.stack([trained.predict({key: value[i] for key, value in batch.items()})[0] for i in range(8)])
+    assert np.abs(planned - actions).max() > 0.1, "plans lead elsewhere at first"
+
+
+def test_straight_on_knows_what_its_agent_learns() -> None:
+    agent = new_agent(learning_starts=50)
+    straight, seen = StraightOn(agent), toy().reset(seed=3)[0]
+    before = straight.predict(seen)[0]
+    agent.learn(150)
+    assert not np.array_equal(straight.predict(seen)[0], before)
 
 
 class AnyStart(gym.Wrapper):
@@ -207,10 +245,13 @@ class AnyStart(gym.Wrapper):
         return self.env.reset(options={"start": start, **(options or {})})
 
 
+STEPS = 2_500
+
+
 @pytest.fixture(scope="module")
 def covering() -> CoveringOptions:
     env = AnyStart(toy(maze_map=CORRIDOR))
-    return CoveringOptions(env, n_options=2, option_updates=2_000, reach=10, seed=0).learn(4_000)
+    return CoveringOptions(env, n_options=2, option_updates=1_000, reach=10, batch_size=64, seed=0).learn(STEPS)
 
 
 def test_covering_options_end_where_the_embedding_is_lowest(covering: CoveringOptions) -> None:
@@ -255,7 +296,7 @@ def test_a_goal_is_no_dead_end_for_covering_options_but_a_pit_is(covering: Cover
 
 
 def test_steps_are_the_environments_and_decisions_fewer(covering: CoveringOptions) -> None:
-    assert 4_000 <= covering.num_timesteps < 4_000 + covering.env.timeout
+    assert STEPS <= covering.num_timesteps < STEPS + covering.env.timeout
     assert covering.store.total == covering.num_timesteps
     assert covering.model.num_timesteps < covering.num_timesteps
     assert covering.model.exploration_rate == pytest.approx(0.1)
@@ -263,10 +304,9 @@ def test_steps_are_the_environments_and_decisions_fewer(covering: CoveringOption
 
 
 def test_covering_options_reach_goals(covering: CoveringOptions) -> None:
-    corridor = {"maze_map": CORRIDOR, "max_steps": 60}
     walk = RandomWalk(covering.env.unwrapped.action_space, seed=0)
-    assert evaluate_pairs(walk, TOY, env_kwargs=corridor, n_pairs=40).success_rate < 0.2
-    assert evaluate_pairs(covering, TOY, env_kwargs=corridor, n_pairs=40).success_rate >= 0.5
+    assert evaluate_pairs(walk, TOY, env_kwargs=SHORT_CORRIDOR, n_pairs=40).success_rate < 0.2
+    assert evaluate_pairs(covering, TOY, env_kwargs=SHORT_CORRIDOR, n_pairs=40).success_rate >= 0.5
 
 
 def test_an_ants_primitive_action_is_a_step_of_a_global_option() -> None:

@@ -1,5 +1,6 @@
 """The examples run as they are, with fewer steps."""
 
+import re
 import runpy
 import sys
 from pathlib import Path
@@ -13,6 +14,7 @@ from conftest import TOY
 
 from sb3_skillgraph import SkillGraphAgent
 
+Capture = pytest.CaptureFixture[str]
 EXAMPLES = Path(__file__).parent.parent / "examples"
 
 
@@ -21,20 +23,19 @@ def run(monkeypatch: pytest.MonkeyPatch, name: str, *arguments: object) -> None:
     runpy.run_path(str(EXAMPLES / name), run_name="__main__")
 
 
-def test_quickstart(monkeypatch: Any, tmp_path: Path, capsys: Any) -> None:
+def test_quickstart(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: Capture) -> None:
     run(monkeypatch, "quickstart.py", "--env", TOY, "--steps", 300, "--out", tmp_path / "new")
-    assert "the goal" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "The goal lies" in printed and "go there" in printed
+    assert "reached the goal" in printed or "did not reach the goal" in printed
     assert {path.name for path in (tmp_path / "new").iterdir()} == {"agent.zip", "skill_graph.png", "plan.png"}
 
 
-def test_own_environment(monkeypatch: Any, capsys: Any) -> None:
+def test_own_environment(monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
     run(monkeypatch, "own_environment.py", "--steps", 300)
-    assert "success rate: " in capsys.readouterr().out
-
-
-def test_options_env(monkeypatch: Any, capsys: Any) -> None:
-    run(monkeypatch, "options_env.py", "--env", TOY, "--steps", 400, "--decisions", 150)
-    assert capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert " events, " in printed and " edges" in printed
+    assert re.search(r"success rate: [01]\.\d\d", printed)
 
 
 class Darkness:
@@ -54,7 +55,7 @@ class Darkness:
 
 
 @pytest.mark.mujoco
-def test_ant_to_any_goal(monkeypatch: Any, tmp_path: Path, capsys: Any) -> None:
+def test_ant_to_any_goal(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: Capture) -> None:
     monkeypatch.setattr(mujoco, "Renderer", Darkness)
     agent = SkillGraphAgent("MultiInputPolicy", gym.make("SkillGraph/AntUMaze-v0"), seed=0)
     agent.save(tmp_path / "agent.zip")
@@ -63,7 +64,7 @@ def test_ant_to_any_goal(monkeypatch: Any, tmp_path: Path, capsys: Any) -> None:
     run(monkeypatch, "ant_to_any_goal.py", tmp_path / "agent.zip", *goals, *more)
     out = capsys.readouterr().out
     assert "goal [-3.9, 4.1]: " in out and "steps, reached" in out
-    assert "goal [-4.0, -4.0]: outside, " in out
+    assert "goal [-4.0, -4.0]: off_graph, " in out
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"way_0.png", "way_1.png", "ant.gif", "ant.png"}
     assert Darkness.n_frames > 10
     with pytest.raises(SystemExit):

@@ -21,7 +21,7 @@ from filelock import FileLock
 from imageio.v3 import imread
 
 from sb3_skillgraph.cli import main
-from sb3_skillgraph.experiments import RunSpec, compare, learners, load_plan, run, runner, status
+from sb3_skillgraph.experiments import RunSpec, compare, figures, learners, load_plan, run, runner, status
 from sb3_skillgraph.experiments.figures import method_curves, practice_curves
 from sb3_skillgraph.experiments.summary import estimate, interquartile_mean
 from sb3_skillgraph.run_folder import checkpoints, read_progress
@@ -32,14 +32,12 @@ SMALL_NETS = {
     "batch_size": 32,
     "learning_starts": 100,
     "train_freq": 1,
-    "option_timeout": 50,
-    "salient_event_freq": 3,
-    "event_reach": 10,
+    "exploration_steps": 20,
 }
 
 
 def spec(algorithm: str = "skill_graph", steps: int = 600, **changes: Any) -> RunSpec:
-    arguments = SMALL_NETS if algorithm in ("skill_graph", "planning_off", "recipe") else {}
+    arguments = SMALL_NETS if algorithm in ("skill_graph", "straight_on", "recipe") else {}
     values: dict[str, Any] = dict(check_every=200, pairs=3, final_pairs=4, arguments=arguments, seed=0, test_pairs=0)
     return RunSpec(algorithm, "toy", algorithm=algorithm, env_id=TOY, steps=steps, **{**values, **changes})
 
@@ -74,10 +72,16 @@ def test_the_plans_of_the_benchmarks_can_be_read(file: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "algorithm", ["skill_graph", "planning_off", "uvfa", "her", "recipe", "covering_options", "random_walk"]
+    "algorithm", ["skill_graph", "straight_on", "uvfa", "her", "recipe", "covering_options", "random_walk"]
 )
-def test_a_run_leaves_everything_and_is_not_done_again(algorithm: str, tmp_path: Path) -> None:
-    arguments = {"covering_options": {"n_options": 2, "option_updates": 20}}
+def test_a_run_leaves_everything_and_is_not_done_again(
+    algorithm: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(runner, "STRETCH", 150)
+    arguments: dict[str, dict[str, Any]] = {
+        "covering_options": {"n_options": 2, "option_updates": 20, "batch_size": 32},
+        **dict.fromkeys(("uvfa", "her"), {"buffer_size": 2_000}),  # SB3 saves and loads all of it
+    }
     changes = {"arguments": arguments[algorithm]} if algorithm in arguments else {}
     this = spec(algorithm, steps=400, test_pairs=2, test_stretches=1, **changes)
     assert run(this, tmp_path) == "done", (this.folder(tmp_path) / "error.txt").read_text()
@@ -173,7 +177,7 @@ def test_what_is_done_is_not_taken_for_something_else(tmp_path: Path) -> None:
 
 
 def test_a_run_with_other_recommended_settings_is_something_else(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    this = spec("planning_off")
+    this = spec("straight_on")
     assert run(this, tmp_path) == "done"
     config = json.loads((this.folder(tmp_path) / "config.json").read_text())
     assert config["resolved"].items() >= {**this.arguments, "policy": "MultiInputPolicy"}.items()
@@ -196,19 +200,27 @@ def die_once(spec: RunSpec, out: Path) -> str:
     return "done"
 
 
-def die(spec: RunSpec, out: Path) -> str:
-    """Stands in for a run that always ends its worker."""
-    os.kill(os.getpid(), signal.SIGKILL)
-    return "done"
-
-
 def test_a_killed_worker_does_not_end_the_others_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    specs = [spec(seed=seed) for seed in range(4)]
     monkeypatch.setattr(runner, "run", die_once)
-    assert compare(specs, tmp_path, n_jobs=2) == ["done"] * 4
-    monkeypatch.setattr(runner, "run", die)
-    with pytest.raises(BrokenProcessPool):  # but one that nothing survives
-        compare(specs, tmp_path, n_jobs=2)
+    assert compare([spec(seed=seed) for seed in range(3)], tmp_path, n_jobs=2) == ["done"] * 3
+
+
+def test_a_run_that_ends_every_worker_is_given_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    tries = []
+
+    class Dying:
+        """Stands in for joblib's workers, all of which are killed."""
+
+        def __init__(self, **_: Any) -> None:
+            tries.append(self)
+
+        def __call__(self, calls: Any) -> Any:
+            raise BrokenProcessPool
+
+    monkeypatch.setattr(runner, "Parallel", Dying)
+    with pytest.raises(BrokenProcessPool):
+        compare([spec()], tmp_path, n_jobs=2)
+    assert len(tries) == 2  # nothing had got any further meanwhile
 
 
 def test_a_run_that_another_worker_does_is_left_to_it(tmp_path: Path) -> None:
@@ -242,17 +254,17 @@ def test_an_environment_may_be_tested_otherwise(tmp_path: Path) -> None:
 def test_on_ray(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ray = pytest.importorskip("ray")
     monkeypatch.setenv("RAY_worker_niceness", "0")  # lest its workers starve beside the other tests
-    ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False)
+    ray.init(num_cpus=1, include_dashboard=False, log_to_driver=False)
     try:
         specs = load_plan(plan(tmp_path / "plan.yml", methods={"walk": {"algorithm": "random_walk"}}))
-        assert compare(specs, tmp_path / "runs", n_jobs=2, backend="ray") == ["done"] * 2
+        assert compare(specs, tmp_path / "runs", n_jobs=1, backend="ray") == ["done"] * 2
     finally:
         ray.shutdown()
 
 
 def test_on_dask(tmp_path: Path) -> None:
     specs = load_plan(plan(tmp_path / "plan.yml", methods={"walk": {"algorithm": "random_walk"}}))
-    assert compare(specs, tmp_path / "runs", n_jobs=2, backend="dask") == ["done"] * 2
+    assert compare(specs, tmp_path / "runs", n_jobs=1, backend="dask") == ["done"] * 2
 
 
 def test_on_a_dask_cluster_that_is_there_already(tmp_path: Path) -> None:
@@ -264,62 +276,79 @@ def test_on_a_dask_cluster_that_is_there_already(tmp_path: Path) -> None:
         assert compare(specs, tmp_path / "runs", n_jobs=2, backend="dask") == ["done"] * 2
 
 
-WORKER = """
-import os, signal, sys
+WORKERS = """
+import json, os, signal, sys
 from pathlib import Path
 from sb3_skillgraph.agent import SkillGraphAgent
 from sb3_skillgraph.experiments import compare, load_plan, runner
 
-plan, out, place, left = Path(sys.argv[1]), Path(sys.argv[2]), sys.argv[3], int(sys.argv[4])
+plan, out, rounds = Path(sys.argv[1]), Path(sys.argv[2]), json.loads(sys.argv[3])
 
-def killed_in_time(call):
-    def counted(*arguments, **kwargs):
-        global left
-        left -= 1
-        if left == 0:
-            os.kill(os.getpid(), signal.SIGKILL)
-        return call(*arguments, **kwargs)
-    return counted
+def work(place, left):
+    def killed_in_time(call):
+        def counted(*arguments, **kwargs):
+            nonlocal left
+            left -= 1
+            if left == 0:
+                os.kill(os.getpid(), signal.SIGKILL)
+            return call(*arguments, **kwargs)
+        return counted
 
-owner, name = {
-    "step": (SkillGraphAgent, "_store_transition"),
-    "test": (SkillGraphAgent, "act"),
-    "write": (os, "fsync"),
-    "save": (SkillGraphAgent, "save_replay_buffer"),
-}[place]
-setattr(owner, name, killed_in_time(getattr(owner, name)))
-do = runner._Run.do
+    owner, name = {
+        "step": (SkillGraphAgent, "_store_transition"),
+        "test": (SkillGraphAgent, "act"),
+        "write": (os, "fsync"),
+        "save": (SkillGraphAgent, "save_replay_buffer"),
+    }[place]
+    setattr(owner, name, killed_in_time(getattr(owner, name)))
+    do = runner._Run.do
 
-def noted(self):
-    with (out / "begun.txt").open("a") as file:
-        file.write(f"{self.folder.name}\\n")
-    do(self)
+    def noted(self):
+        with (out / "begun.txt").open("a") as file:
+            file.write(f"{self.folder.name}\\n")
+        do(self)
 
-runner._Run.do = noted
-compare(load_plan(plan), out)
+    runner._Run.do = noted
+    compare(load_plan(plan), out)
+
+ends = []
+for workers in rounds:  # those of one round at the same time
+    begun = []
+    for worker in workers:
+        begun.append(os.fork())
+        if begun[-1] == 0:
+            try:
+                work(*worker)
+                os._exit(0)
+            finally:
+                os._exit(1)
+    ends.append([os.waitstatus_to_exitcode(os.waitpid(worker, 0)[1]) for worker in begun])
+print(json.dumps(ends))
 """
 
 
-def work(plan_file: Path, out: Path, place: str = "step", calls_to_live: int = 0) -> subprocess.Popen[bytes]:
-    command = [sys.executable, "-c", WORKER, str(plan_file), str(out), place, str(calls_to_live)]
-    return subprocess.Popen(command, env={**os.environ, "OMP_NUM_THREADS": "1"})
+def work(plan_file: Path, out: Path, rounds: list[list[tuple[str, int]]]) -> list[list[int]]:
+    """Let workers do a plan that are killed at the n-th call of something, never for 0; return how they ended."""
+    command = [sys.executable, "-c", WORKERS, str(plan_file), str(out), json.dumps(rounds)]
+    done = subprocess.run(command, env={**os.environ, "OMP_NUM_THREADS": "1"}, check=True, stdout=subprocess.PIPE, text=True)
+    ends: list[list[int]] = json.loads(done.stdout.splitlines()[-1])
+    return ends
 
 
 def test_killed_at_any_moment_it_comes_to_the_same_and_two_workers_share(tmp_path: Path) -> None:
     methods = {"dsg": {"algorithm": "skill_graph", "arguments": SMALL_NETS}}
-    file = plan(tmp_path / "plan.yml", methods=methods, environments={"toy": {"id": TOY, "steps": 700}}, check_every=100)
+    toy = {"id": TOY, "steps": 500, "kwargs": {"max_steps": 60}}
+    file = plan(tmp_path / "plan.yml", methods=methods, environments={"toy": toy}, check_every=100)
     specs, alone, shared = load_plan(file), tmp_path / "alone", tmp_path / "shared"
     compare(specs, alone)
     shared.mkdir()
     steps = np.random.default_rng(0).integers(120, 300, 3).tolist()
-    deaths = [*(("step", n) for n in steps), ("write", 2), ("save", 2), ("test", 150)]
-    for place, calls_to_live in deaths:
-        assert work(file, shared, place, calls_to_live).wait() == -signal.SIGKILL
+    deaths = [*(("step", n) for n in steps), ("write", 2), ("save", 2), ("test", 90)]
+    assert work(file, shared, [[death] for death in deaths]) == [[-signal.SIGKILL]] * len(deaths)
     unfinished = [s.spec.folder(shared).name for s in status(specs, shared) if s.state != "done"]
     assert unfinished
     (shared / "begun.txt").unlink()
-    workers = [work(file, shared) for _ in range(2)]
-    assert [worker.wait() for worker in workers] == [0, 0]
+    assert work(file, shared, [[("step", 0), ("step", 0)]]) == [[0, 0]]
     assert sorted((shared / "begun.txt").read_text().split()) == unfinished  # each by one of them
     for s in specs:
         assert (s.folder(shared) / "done.json").exists()
@@ -396,12 +425,11 @@ def test_interquartile_mean_and_its_interval() -> None:
 def runs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     folder = tmp_path_factory.mktemp("compare")
     methods = {
-        # So that chains have several options, for Figure 8.
-        "frontier": {"algorithm": "skill_graph", "arguments": {**SMALL_NETS, "evidence_edges": False, "option_timeout": 15}},
-        "dco": {"algorithm": "skill_graph", "arguments": {**SMALL_NETS, "salience": "dco", "retry_after": 50}},
+        "frontier": {"algorithm": "skill_graph", "arguments": SMALL_NETS},
+        "dco": {"algorithm": "skill_graph", "arguments": {**SMALL_NETS, "salience": "dco"}},
         "walk": {"algorithm": "random_walk"},
     }
-    toy = {"toy": {"id": TOY, "steps": 1600}}
+    toy = {"toy": {"id": TOY, "steps": 1200}}
     file = plan(
         folder / "plan.yml", methods=methods, environments=toy, seeds=[1], check_every=400, test_pairs=1, test_stretches=1
     )
@@ -409,8 +437,9 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     return file, folder / "runs"
 
 
-@pytest.mark.parametrize("number", [3, 4, 5, 6, 7, 8, 9])
-def test_figures_of_the_paper(number: int, runs: tuple[Path, Path], tmp_path: Path) -> None:
+@pytest.mark.parametrize("number", [3, 4, 5, 6, 9])
+def test_figures_of_the_paper(number: int, runs: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(figures, "N_PAIRS", 1_000)
     file, out = runs
     picture = tmp_path / "figure.png"
     assert main(["figure", str(number), str(file), "--out", str(out), "--to", str(picture)]) == 0
@@ -424,11 +453,11 @@ def test_curves_are_the_seeds_rows(runs: tuple[Path, Path]) -> None:
     curves = method_curves(specs, runs[1])
     assert list(curves) == ["frontier", "dco", "walk"]
     rows = read_progress(specs[0].folder(runs[1]))
-    assert curves["frontier"].steps.tolist() == [400, 800, 1200, 1600]
+    assert curves["frontier"].steps.tolist() == [400, 800, 1200]
     same = [pair["success"] for pair in json.loads((specs[0].folder(runs[1]) / "done.json").read_text())["pairs"][:2]]
     expected = [*(float(row["eval/success_rate"]) for row in rows[:-1]), np.mean(same)]
     assert curves["frontier"].mean.tolist() == pytest.approx(expected)
-    assert curves["walk"].steps.tolist() == [0, 1600]
+    assert curves["walk"].steps.tolist() == [0, 1200]
     tested = practice_curves(specs, runs[1])
     assert list(tested) == ["frontier", "dco", "walk"]
     assert all(curve.steps.tolist() == [0, 1000] for curve in tested.values())
@@ -438,6 +467,8 @@ def test_curves_are_the_seeds_rows(runs: tuple[Path, Path]) -> None:
     ("words", "message"),
     [
         (["figure", "2"], "no Figure 2"),
+        (["figure", "7"], "no Figure 7"),  # it shows edges between skills
+        (["figure", "8"], "no Figure 8"),
         (["figure", "5", "--method", "frontire"], "no method 'frontire'; it has frontier, dco, walk"),
         (["figure", "3", "--method", "walk"], "needs a finished run of a skill graph"),
         (["figure", "9", "--method", "frontier"], "with salience=dco"),

@@ -13,8 +13,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sb3_skillgraph import graph as graph_module
+from sb3_skillgraph.edges import MAX_LANDINGS, NOWHERE, Edges
 from sb3_skillgraph.events import Event
-from sb3_skillgraph.graph import GROWTH, MAX_LANDINGS, NOWHERE, SPACING, YOUNG, Edges, SkillGraph
+from sb3_skillgraph.graph import GROWTH, SPACING, YOUNG, SkillGraph
 
 every_time = settings(derandomize=True, deadline=None, max_examples=40, database=None)
 
@@ -448,6 +449,7 @@ def test_the_version_rises_with_every_change() -> None:
         lambda: graph.ran(0, 1, False, 0, 10),
         lambda: graph.add_event(np.ones(2), salient=False),
         lambda: graph.coarsen(),
+        lambda: setattr(graph, "now", 7.0),
         lambda: graph.set_state(graph.get_state()),
     ]
     for change in changes:

@@ -22,7 +22,7 @@ from sb3_skillgraph.envs import MazeMap
 from sb3_skillgraph.evaluation import evaluate_pairs, run_pair
 from sb3_skillgraph.events import Event
 from sb3_skillgraph.options.factory import copy_policy
-from sb3_skillgraph.options.learner import OptionDDPG, OptionTD3
+from sb3_skillgraph.options.learner import OptionTD3
 from sb3_skillgraph.options.views import egocentric_view
 
 ZIGZAG: MazeMap = [[1] * 7, [1, "r", 0, 0, 0, 0, 1], [1, 1, 1, 1, 1, 0, 1], [1, 0, 0, 0, 0, 0, 1], [1] * 7]
@@ -42,7 +42,7 @@ def test_reaches_goals_it_never_trained_on() -> None:
     )
     untrained = evaluate_pairs(agent, TOY, n_pairs=40).success_rate
     random = evaluate_pairs(RandomWalk(), TOY, n_pairs=40).success_rate
-    agent.learn(4000, log_interval=None)
+    agent.learn(3500, log_interval=None)
     trained = evaluate_pairs(agent, TOY, n_pairs=40)
     assert trained.success_rate > max(untrained, random) + 0.2
     assert trained.success_rate > 0.6
@@ -356,7 +356,7 @@ def test_option_env_goes_on_where_the_last_run_ended() -> None:
     np.testing.assert_array_equal(base.starts[-1], [1.0, -1.0])
 
 
-@pytest.mark.parametrize("option_class", [OptionDDPG, OptionTD3, TD3, SAC])
+@pytest.mark.parametrize("option_class", [OptionTD3, SAC])
 def test_an_option_that_copies_another_goes_on_learning_like_it(option_class: Any) -> None:
     agent = new_agent(option_class=option_class).learn(800)
     source = agent.parts.walker
@@ -393,7 +393,6 @@ def test_option_env_leads_into_the_initiation_set_of_an_option() -> None:
     assert not info["can_start"]
 
 
-@pytest.mark.xfail(strict=True, raises=AttributeError, reason="walks know neither radius nor centre: OptionEnv takes none yet")
 def test_option_env_takes_a_walk(trained: SkillGraphAgent) -> None:
     walk = trained.options[0]
     env = OptionEnv(gym.make(TOY), walk)

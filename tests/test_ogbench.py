@@ -101,7 +101,6 @@ def test_other_environments_of_ogbench_are_refused(name: str) -> None:
         make(POINT, name=name)
 
 
-@pytest.mark.xfail(strict=True, reason="Gymnasium's own error comes through")
 def test_a_maze_that_there_is_not() -> None:
     with pytest.raises(ValueError, match="pointmaze-huge-v0"):
         make(POINT, name="pointmaze-huge-v0")
@@ -113,9 +112,7 @@ def test_a_maze_that_there_is_not() -> None:
         {"success_radius": -1.0},
         {"success_radius": np.nan},
         {"max_steps": 0},
-        pytest.param(
-            {"success_radius": 0.0}, marks=pytest.mark.xfail(strict=True, reason="0 is taken for OGBench's own radius")
-        ),
+        {"success_radius": 0.0},
     ],
     ids=str,
 )

@@ -27,9 +27,10 @@ from sb3_skillgraph.choices import (
     Runs,
     Start,
 )
-from sb3_skillgraph.graph import MAX_LANDINGS, NOWHERE, SkillGraph
+from sb3_skillgraph.edges import MAX_LANDINGS, NOWHERE
+from sb3_skillgraph.graph import SkillGraph
 from sb3_skillgraph.plan import Plan, describe
-from sb3_skillgraph.planning import FOR_GOOD, LOST_HORIZONS, Planner, Solution, timeout
+from sb3_skillgraph.planning import FOR_GOOD, LEAST, LOST_HORIZONS, Planner, Solution, timeout
 from sb3_skillgraph.runner import Runner, RunnerState
 from sb3_skillgraph.walk_model import FIRST_GUESS, WalkModel
 
@@ -166,13 +167,13 @@ def at(graph: SkillGraph, index: int) -> Start:
     return Start(graph.centers[index].copy(), index)
 
 
-def events_on(planner: Planner, solution: Solution) -> list[int]:
+def targets_on(planner: Planner, solution: Solution) -> list[int]:
     """The targets on the path of a solution's best first choice."""
-    return planner.path(solution, solution.first())
+    return [target for target, _ in planner.path(solution, solution.first())]
 
 
 def runs(*rows: tuple[int, int, bool, int, int]) -> Runs:
-    """Rows of source, target, success, landing and count."""
+    """Rows of source, target, success, landing and number."""
     return Runs(*np.array(rows, dtype=np.int64).reshape(-1, 5).T)
 
 
@@ -269,7 +270,7 @@ def test_a_vertex_from_which_nothing_leads_to_the_goal_is_as_good_as_lost() -> N
     )
     assert solution.values[[0, 4]] == pytest.approx([5.0, 10.0])
     assert solution.values[[1, 2]].tolist() == [LOST, LOST]
-    assert planner.path(solution, solution.first()) == [0, 3]
+    assert planner.path(solution, solution.first()) == [(0, 0), (3, 3)]
 
 
 def test_a_run_that_always_fails_where_it_began_is_no_way() -> None:
@@ -283,8 +284,7 @@ def test_a_run_that_always_fails_where_it_began_is_no_way() -> None:
 
 def test_of_equal_choices_the_first_is_taken_and_at_the_start_the_walk_to_the_goal() -> None:
     def targets(*rows: Any) -> list[int]:
-        planner, solution = solve(3, Given.of([(v, t, 1.0, steps, [(v, 1.0)]) for v, t, steps in rows]))
-        return planner.path(solution, solution.first())
+        return targets_on(*solve(3, Given.of([(v, t, 1.0, steps, [(v, 1.0)]) for v, t, steps in rows])))
 
     onward = [(v, 3, 7.0) for v in (0, 1, 2)]
     assert targets((4, 0, 5.0), (4, 1, 5.0), *onward) == [0, 3]
@@ -348,7 +348,9 @@ def random_question(rng: np.random.Generator, graph: SkillGraph) -> tuple[Start,
     point = rng.uniform(-3.0, 15.0, 2)
     event = int(rng.integers(n)) if rng.random() < 0.3 else graph.locate(point)
     stance = (OPTIMISTIC, EXPECTED, PESSIMISTIC)[rng.integers(3)]
-    return Start(point, event), rng.uniform(-3.0, 15.0, 2), random_runs(rng, n, int(rng.integers(0, 6))), stance
+    towards = int(rng.integers(n + 1)) if rng.random() < 0.5 else NOWHERE
+    start = Start(point, event, towards)
+    return start, rng.uniform(-3.0, 15.0, 2), random_runs(rng, n, int(rng.integers(0, 6))), stance
 
 
 # -- choices ----------------------------------------------------------------------------------------------------------
@@ -371,6 +373,8 @@ def test_choices_are_well_formed_and_the_goal_can_be_tried_from_every_start(seed
     lands = np.where(share > 0.0, landing, NOWHERE)
     assert ((lands[~at_start] >= NOWHERE) & (lands[~at_start] < n_events)).all()
     assert (found.target[at_start] == n_events).sum() == 1
+    if start.towards != NOWHERE:
+        assert (found.target[at_start] == start.towards).sum() == 1  # what runs can go on
     assert not (found.target == n_events + 1).any()
     assert at_start[-at_start.sum() :].all()  # the last rows
     pairs = list(zip(found.source.tolist(), found.target.tolist(), strict=True))
@@ -435,6 +439,38 @@ def test_a_record_that_has_aged_says_less() -> None:
     assert young < 0.05 < 0.2 < old < FIRST_GUESS
 
 
+def test_what_training_has_shown_is_told_as_of_now() -> None:
+    graph = line_graph(2)
+    tried(graph, 0, 1, 0, 20)
+    model = ChoiceModel(graph, WalkModel())
+    model.walks()
+    graph.now = 50_000.0
+    for known, made_now in zip(model.walks(), ChoiceModel(graph, WalkModel()).walks(), strict=True):
+        np.testing.assert_array_equal(known, made_now)
+
+
+def test_an_untried_walk_is_judged_by_those_that_share_an_event_with_it_and_are_hasty_as_it_is() -> None:
+    def rates(hasty: bool, source: int, target: int) -> tuple[float, float]:
+        graph, model = line_graph(8), WalkModel()
+        model.fastest = 5.0  # steps for a radius: 20 from one event to the next
+        for pair, steps in (((0, 1), 20), ((0, 3), 2)):
+            graph.crossed(*pair, steps)
+        for untried in ((0, 2), (4, 1), (5, 6)):
+            graph.crossed(*untried, 2 if hasty else 60)
+        guess = ChoiceModel(graph, model).walks().guess[graph.edges.find(source, target)]
+        for _ in range(30):
+            graph.ran(0, 1, True, 1, 20)
+        return float(guess), float(ChoiceModel(graph, model).walks().guess[graph.edges.find(source, target)])
+
+    for source, target in ((0, 2), (4, 1)):  # out of the same event, into the same one
+        before, after = rates(False, source, target)
+        assert after > before + 0.1
+        before, after = rates(True, source, target)
+        assert after == before
+    before, after = rates(False, 5, 6)
+    assert after == before
+
+
 def test_a_walk_that_failed_early_in_training_is_tried_again_when_its_kind_has_come_to_succeed() -> None:
     graph = SkillGraph(2, 1.0, 100)
     around = [(4.0 + 2.0 * np.cos(angle), 2.0 * np.sin(angle)) for angle in (-1.5, -0.75, 0.0, 0.75, 1.5)]
@@ -453,12 +489,12 @@ def test_a_walk_that_failed_early_in_training_is_tried_again_when_its_kind_has_c
         model.fit(planner.choice_model.kinds(), *weights)
 
     fit()
-    assert events_on(planner, planner.solve(at(graph, 0), graph.centers[1]))[0] == 2
+    assert targets_on(planner, planner.solve(at(graph, 0), graph.centers[1]))[0] == 2
     graph.now = 40_000.0  # updates of the walker later, walks of this length succeed
     for pair in detour:
         tried(graph, *pair, 10)
     fit()
-    assert events_on(planner, planner.solve(at(graph, 0), graph.centers[1]))[0] in (1, goal)
+    assert targets_on(planner, planner.solve(at(graph, 0), graph.centers[1]))[0] in (1, goal)
     row = graph.edges.find(0, 1)
     before = planner.choice_model.walks().success(EXPECTED)[row]
     for _ in range(2):
@@ -484,6 +520,18 @@ def test_runs_of_the_episode_count_more_than_those_of_training() -> None:
     assert untouched.success(EXPECTED)[row_of(untouched, 0, 1)] == pytest.approx(expected)
 
 
+def test_a_rare_landing_that_gives_way_to_a_new_one_takes_its_runs_along() -> None:
+    graph = line_graph(8)
+    for landing in range(2, 2 + MAX_LANDINGS):
+        tried(graph, 0, 1, 0, 6, landing=landing)
+    found = everything(graph, WalkModel(), at(graph, 7), np.array([90.0, 0.0]), runs((0, 1, False, 6, 1)))
+    row = row_of(found, 0, 1)
+    weights = found.weight[row]
+    assert weights[found.landing[row] == 6].tolist() == [EPISODE_WEIGHT]  # those of another event are not its own
+    assert weights.sum() == pytest.approx(6.0 * (MAX_LANDINGS - 1) + EPISODE_WEIGHT)
+    assert found.failures[row] == pytest.approx(6.0 * MAX_LANDINGS + EPISODE_WEIGHT)  # that they failed is not forgotten
+
+
 def test_a_goal_beside_an_event_can_be_reached_from_wherever_the_event_can() -> None:
     graph = line_graph(12)
     for i in range(11):
@@ -493,6 +541,35 @@ def test_a_goal_beside_an_event_can_be_reached_from_wherever_the_event_can() -> 
     success = found.success(EXPECTED)
     assert success[row_of(found, 13, 12)] == success[row_of(found, 0, 12)]
     assert success[row_of(found, 0, 12)] == pytest.approx(BESIDE * success[row_of(found, 0, 11)], rel=0.02)
+
+
+def test_a_goal_is_as_hard_to_reach_as_the_event_that_it_lies_in() -> None:
+    graph = line_graph(8)
+    tried(graph, 0, 1, 0, 20, landing=2)
+    tried(graph, 2, 1, 20)
+    found = everything(graph, WalkModel(), at(graph, 0), graph.centers[1])
+    success = found.success(EXPECTED)
+    for source in (0, 2):  # both of them near enough for a guess
+        walk, to_goal = row_of(found, source, 1), row_of(found, source, 8)
+        assert success[to_goal] == pytest.approx(BESIDE * success[walk], rel=0.02)
+        assert found.failures[to_goal] == found.failures[walk]
+        np.testing.assert_array_equal(found.landing[to_goal], found.landing[walk])
+        np.testing.assert_array_equal(found.weight[to_goal], found.weight[walk])
+    assert success[row_of(found, 0, 8)] < 0.1 < 0.8 < success[row_of(found, 2, 8)]
+
+
+def test_what_an_episode_shows_of_the_walk_to_an_event_counts_for_a_goal_in_it_too() -> None:
+    graph = line_graph(8)
+    tried(graph, 0, 1, 4)
+    goal = graph.centers[1]
+
+    def rate(*shown: tuple[int, int, bool, int, int]) -> float:
+        found = everything(graph, WalkModel(), at(graph, 0), goal, runs(*shown))
+        return float(found.success(EXPECTED)[row_of(found, 0, 8)])
+
+    assert rate((0, 1, False, 0, 3)) < rate() - 0.2
+    assert rate((0, 8, False, 0, 3)) == pytest.approx(rate((0, 1, False, 0, 3)))
+    assert rate((0, 1, False, 0, 3), (0, 8, False, 0, 3)) < rate((0, 1, False, 0, 3)) - 0.1
 
 
 def test_a_goal_in_no_event_can_be_tried_from_the_nearest_events_and_the_start() -> None:
@@ -529,6 +606,16 @@ def test_what_can_be_done_in_an_event_can_be_done_by_who_is_there() -> None:
             np.testing.assert_array_equal(column[there], column[here])
 
 
+def test_an_option_that_runs_can_go_on_where_it_could_not_be_begun() -> None:
+    graph = line_graph(12)
+    for event in (0, NOWHERE):
+        for towards, known in ((11, False), (1, event == NOWHERE), (12, True), (NOWHERE, True)):
+            others = everything(graph, WalkModel(), Start(np.zeros(2), event), np.array([20.0, 9.0]))
+            found = everything(graph, WalkModel(), Start(np.zeros(2), event, towards), np.array([20.0, 9.0]))
+            targets, added = found.target[found.source == 13].tolist(), [] if known else [towards]
+            assert targets == [*others.target[others.source == 13].tolist(), *added]
+
+
 # -- which way --------------------------------------------------------------------------------------------------------
 
 
@@ -546,7 +633,7 @@ def test_a_safe_detour_beats_a_gamble_that_may_land_nowhere() -> None:
     graph = gamble(detour=True)
     planner = Planner(graph, hopeless(), HORIZON)
     solution = planner.solve(at(graph, 0), graph.centers[3])
-    assert events_on(planner, solution) == [1, 2, 3, 4]
+    assert targets_on(planner, solution) == [1, 2, 3, 4]
     row = row_of(solution.episode, solution.start, 3)
     assert solution.episode_costs[row] > solution.values[solution.start]
 
@@ -555,7 +642,7 @@ def test_a_gamble_is_taken_where_nothing_safe_leads_there() -> None:
     graph = gamble(detour=False)
     planner = Planner(graph, hopeless(), HORIZON)
     solution = planner.solve(at(graph, 0), graph.centers[3])
-    assert events_on(planner, solution) == [3, 4]
+    assert targets_on(planner, solution) == [3, 4]
     assert solution.values[solution.start] < LOST
 
 
@@ -565,11 +652,11 @@ def test_a_detour_that_fails_in_this_episode_is_left() -> None:
         tried(graph, source, target, 8)
     planner = Planner(graph, hopeless(), HORIZON)
     goal = graph.centers[4]
-    assert events_on(planner, planner.solve(at(graph, 0), goal)) == [1, 4, 5]
+    assert targets_on(planner, planner.solve(at(graph, 0), goal)) == [1, 5]
     failed = planner.solve(at(graph, 0), goal, runs((0, 1, False, 0, 4)))
-    assert events_on(planner, failed) == [2, 3, 4, 5]
+    assert targets_on(planner, failed) == [2, 3, 5]
     both = planner.solve(at(graph, 0), goal, runs((0, 1, False, 0, 4), (0, 2, False, 0, 40)))
-    assert events_on(planner, both)[0] == 1  # the lesser evil
+    assert targets_on(planner, both)[0] == 1  # the lesser evil
 
 
 # -- paths ------------------------------------------------------------------------------------------------------------
@@ -583,7 +670,7 @@ def test_a_path_follows_the_likeliest_landing_of_lower_value() -> None:
         (2, 3, 0.9, 10.0, [(0, 1.0)]),
     ]
     planner, solution = solve(3, Given.of(rows))
-    assert planner.path(solution, solution.first())[-2:] == [2, 3]
+    assert planner.path(solution, solution.first()) == [(0, 1), (2, 2), (3, 3)]
 
 
 def test_a_path_does_not_go_where_it_is_further() -> None:
@@ -594,17 +681,66 @@ def test_a_path_does_not_go_where_it_is_further() -> None:
     ]
     planner, solution = solve(3, Given.of(rows))
     assert solution.values[1] > solution.values[0]
-    assert planner.path(solution, solution.first()) == [0, 3]
+    assert planner.path(solution, solution.first()) == [(0, 0), (3, 3)]
+
+
+def test_a_path_goes_on_where_an_option_leads_that_is_not_the_best() -> None:
+    rows = [
+        (4, 0, 0.3, 10.0, [(4, 1.0)]),  # mostly fails, and the best can be begun instead
+        (4, 1, 1.0, 5.0, [(4, 1.0)]),
+        (0, 3, 1.0, 30.0, [(0, 1.0)]),
+        (1, 3, 1.0, 5.0, [(1, 1.0)]),
+    ]
+    planner, solution = solve(3, Given.of(rows))
+    assert solution.first() == 1
+    assert planner.path(solution, 0) == [(0, 0), (3, 3)]
+
+
+def test_a_path_names_no_option_twice() -> None:
+    rows = [
+        (3, 0, 0.3, 10.0, [(1, 1.0)]),  # it is followed to the second event, where the best is the same option
+        (0, 2, 1.0, 10.0, [(0, 1.0)]),
+        (1, 0, 1.0, 10.0, [(1, 1.0)]),
+    ]
+    planner, solution = solve(2, Given.of(rows))
+    assert solution.values[1] < solution.episode_costs[0]
+    assert planner.path(solution, 0) == [(0, 1), (2, 2)]
+
+
+def test_a_path_ends_with_the_walk_to_the_goal_even_where_nothing_leads_there() -> None:
+    planner, solution = solve(2, Given.of([(3, 0, 1.0, 5.0, [(3, 1.0)]), (0, 1, 1.0, 5.0, [(0, 1.0)])]))
+    assert solution.values[solution.start] == LOST
+    assert planner.path(solution, 0) == [(0, 0), (2, 2)]
+
+
+def check_path(solution: Solution, path: list[tuple[int, int]]) -> None:
+    """A path ends with the walk to the goal, and neither an option nor an event comes twice."""
+    targets, ends = [target for target, _ in path], [end for _, end in path]
+    assert path[-1] == (solution.goal, solution.goal)
+    assert len(set(targets)) == len(targets)
+    assert len(set(ends)) == len(ends)
+    assert all(0 <= vertex < solution.goal for pair in path[:-1] for vertex in pair)
+
+
+@every_time
+@given(seeds, st.integers(1, 15), st.sampled_from([0.0, 0.3, 1.0]))
+def test_no_path_comes_past_a_vertex_twice_whatever_it_begins_with(seed: int, n_events: int, nowhere: float) -> None:
+    rows = random_rows(np.random.default_rng(seed), n_events, elsewhere=True, nowhere=nowhere, least=0.05)
+    planner, solution = solve(n_events, Given.of(rows))
+    for first in np.flatnonzero(solution.episode.source == solution.start).tolist():
+        check_path(solution, planner.path(solution, first))
 
 
 @every_time
 @given(seeds, st.integers(1, 20))
 def test_paths_lead_down_to_the_goal_without_cycles(seed: int, n_events: int) -> None:
-    rows = random_rows(np.random.default_rng(seed), n_events, elsewhere=False, least=0.55)
+    rows = random_rows(np.random.default_rng(seed), n_events, elsewhere=False)
     planner, solution = solve(n_events, Given.of(rows))
     hopeful = (solution.episode.source == solution.start) & (solution.episode_costs < 0.9 * LOST)
     for first in np.flatnonzero(hopeful).tolist():
-        path = planner.path(solution, first)
+        steps = planner.path(solution, first)
+        path = [target for target, _ in steps]
+        assert steps == [(target, target) for target in path]
         assert path[0] == solution.episode.target[first]
         assert len(set(path)) == len(path)
         values = solution.values[path].tolist()
@@ -612,8 +748,8 @@ def test_paths_lead_down_to_the_goal_without_cycles(seed: int, n_events: int) ->
         for vertex, target in pairwise(path):
             assert target in [row[1] for row in rows if row[0] == vertex]
         assert path[-1] == solution.goal
-        steps = {(row[0], row[1]): row[3] + (1.0 - row[2]) / row[2] * float(timeout(row[3])) for row in rows}
-        total = sum(steps[pair] for pair in pairwise([solution.start, *path]))
+        costs = {(row[0], row[1]): row[3] + (1.0 - row[2]) / row[2] * float(timeout(row[3])) for row in rows}
+        total = sum(costs[pair] for pair in pairwise([solution.start, *path]))
         assert solution.episode_costs[first] == pytest.approx(total, rel=1e-5)
 
 
@@ -625,10 +761,12 @@ def test_on_every_graph_there_is_a_path_to_every_goal(seed: int, n_events: int) 
     planner = Planner(graph, WalkModel(), HORIZON)
     start, goal, episode, stance = random_question(rng, graph)
     solution = planner.solve(start, goal, episode, stance)
-    path = planner.path(solution, solution.first())
-    assert path[-1] == solution.goal
+    for first in np.flatnonzero(solution.episode.source == solution.start).tolist():
+        path = planner.path(solution, first)
+        assert path[0][0] == solution.episode.target[first]
+        check_path(solution, path)
     probability, steps = planner.promise(solution, solution.first(), float(HORIZON))
-    assert 0.0 < probability <= 1.0
+    assert LEAST <= probability <= 1.0
     assert 0.0 <= steps <= HORIZON
 
 
@@ -693,6 +831,20 @@ def test_less_time_promises_less() -> None:
     assert promised[-1] == pytest.approx(0.3 / (1.0 - 0.7 * (1.0 - FOR_GOOD)), abs=0.01)
 
 
+@pytest.mark.parametrize("remaining", [1.0, 5.0, 9.0])
+def test_nothing_is_impossible(remaining: float) -> None:
+    planner, solution = solve(2, Given.of([(3, 2, 0.3, 10.0, [(3, 1.0)])]))
+    assert planner.promise(solution, 0, remaining) == (LEAST, solution.values[solution.start])
+
+
+def test_what_is_sure_is_promised_as_sure_and_no_more() -> None:
+    planner, solution = solve(2, Given.of([(3, 0, 1.0, 7.0, [(3, 1.0)]), (0, 2, 1.0, 7.0, [(0, 1.0)])]))
+    for remaining in np.linspace(30.0, 1_000.0, 40).tolist():
+        probability, steps = planner.promise(solution, 0, remaining)
+        assert 1.0 - 1e-6 < probability <= 1.0
+        assert steps == pytest.approx(14.0, abs=remaining / 100.0)
+
+
 # -- plans as people see them -----------------------------------------------------------------------------------------
 
 
@@ -729,7 +881,7 @@ def test_a_plan_tells_which_of_the_papers_three_cases_holds(goal: tuple[float, f
 
 def test_a_plan_names_options_and_events_in_turn_up_to_the_goal() -> None:
     plan = plan_from(straight_runner(known_line(), hopeless()), (0.0, 0.0), (12.0, 0.0))
-    assert plan.path == ("w1", "e1", "w2", "e2", "w3", "e3", "direct", "goal")
+    assert plan.path == ("w1", "e1", "w2", "e2", "direct", "goal")  # who can walk to e3 can walk to a goal in it
     assert 0.9 < plan.success_probability <= 1.0
     assert 25.0 < plan.expected_steps < 60.0
 
@@ -738,12 +890,18 @@ def test_a_plan_reads_as_a_sentence() -> None:
     runner = straight_runner(known_line(), hopeless())
     plan = plan_from(runner, (0.0, 0.0), (12.0, 0.0))
     expected = f"about {plan.expected_steps:.0f} steps, success {plan.success_probability:.0%}."
-    assert str(plan) == f"The goal lies in an event: go there by way of e1, e2, e3, {expected}"
+    assert str(plan) == f"The goal lies in an event: go there by way of e1, e2, {expected}"
     assert str(plan._replace(path=("direct", "goal"), status="off_graph")).startswith(
         "The goal lies where the agent has never been: go there straight on, "
     )
     beside = plan._replace(status="in_initiation", expected_steps=np.inf)
-    assert str(beside).startswith("The goal lies beside an event: go there by way of e1, e2, e3, no telling when")
+    assert str(beside).startswith("The goal lies beside an event: go there by way of e1, e2, no telling when")
+
+
+def running(option: str, *, began: str, elapsed: float = 0.0, steps: float = 0.0) -> RunnerState:
+    fresh = RunnerState.fresh(1, 2)
+    ids = [np.array([id], dtype=fresh.option.dtype) for id in (option, began)]
+    return fresh._replace(option=ids[0], began=ids[1], elapsed=np.array([elapsed]), steps=np.array([steps]))
 
 
 def test_a_plan_begins_with_the_option_that_runs() -> None:
@@ -752,16 +910,41 @@ def test_a_plan_begins_with_the_option_that_runs() -> None:
     _, state = runner.act(observation, np.array([[12.0, 0.0]]), RunnerState.fresh(1, 2))
     assert state.option.tolist() == ["w1"]
     assert plan_from(runner, (0.0, 0.0), (12.0, 0.0), state).path[0] == "w1"
-    there_and_back = state._replace(option=np.array(["direct"], dtype=state.option.dtype))
-    assert plan_from(runner, (0.0, 0.0), (12.0, 0.0), there_and_back).path == ("direct", "goal")
+    assert plan_from(runner, (0.0, 0.0), (12.0, 0.0), running("direct", began="e0")).path == ("direct", "goal")
+
+
+def test_a_plan_begins_with_the_option_that_runs_where_it_could_not_be_begun() -> None:
+    graph = known_line()
+    graph.crossed(0, 3, 30)
+    runner = straight_runner(graph, hopeless())
+    on_the_way = plan_from(runner, (5.0, 0.0), (8.0, 0.0), running("w3", began="e0"))  # from e0 to e3, in e1
+    assert on_the_way.path[0] == "w3"
+    for began in ("e0", "e2", ""):
+        for option in ("w0", "w1", "w2", "w3"):
+            plan = plan_from(runner, (5.0, 0.0), (8.0, 0.0), running(option, began=began))
+            assert plan.path[0] == option
+            assert plan.path[-2:] == ("direct", "goal")
+            assert len(set(plan.path)) == len(plan.path)
+
+
+def test_the_steps_that_an_option_has_run_count_as_part_of_its_own() -> None:
+    runner = straight_runner(known_line(), hopeless())
+    begun = plan_from(runner, (0.0, 0.0), (12.0, 0.0), running("w1", began="e0", elapsed=950.0))
+    for steps in (3.0, 8.0):
+        state = running("w1", began="e0", elapsed=950.0 + steps, steps=steps)
+        assert plan_from(runner, (2.0, 0.0), (12.0, 0.0), state) == begun
+    late = plan_from(runner, (2.0, 0.0), (12.0, 0.0), running("w1", began="e0", elapsed=980.0, steps=8.0))
+    assert late.success_probability < begun.success_probability
 
 
 def test_time_that_has_passed_makes_success_less_likely() -> None:
     runner = straight_runner(known_line(), hopeless())
-    fresh = RunnerState.fresh(1, 2)
-    probabilities = [
-        plan_from(runner, (0.0, 0.0), (12.0, 0.0), fresh._replace(elapsed=np.full(1, elapsed))).success_probability
-        for elapsed in (0.0, 900.0, 960.0)
+    plans = [
+        plan_from(runner, (0.0, 0.0), (12.0, 0.0), running("", began="", elapsed=elapsed))
+        for elapsed in (0.0, 900.0, 960.0, 995.0, 999.0, 1_000.0, 1_100.0)
     ]
+    probabilities = [plan.success_probability for plan in plans]
     assert probabilities == sorted(probabilities, reverse=True)
-    assert probabilities[0] > probabilities[-1] + 0.02
+    assert probabilities[0] > probabilities[2] + 0.02
+    assert probabilities[-1] == LEAST  # nothing is impossible
+    assert all(0.0 <= plan.expected_steps < np.inf for plan in plans)

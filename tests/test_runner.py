@@ -217,6 +217,15 @@ def test_a_run_to_an_event_that_is_merged_away_meanwhile_ends_like_others() -> N
     assert len(runner.runs(state, 0).source) == 0  # nothing can be concluded from it
 
 
+def test_a_plan_begins_in_the_event_where_the_running_option_began_and_goes_towards_its_target() -> None:
+    runner = make_runner(known_line())
+    point = np.array([5.0, 0.0])
+    for option, began, expected in (("w3", "e0", (0, 3)), ("direct", "e0", (0, 4)), ("w3", "", (-1, 3)), ("", "", (1, -1))):
+        start = runner.start(running(option, began=began), 0, point)
+        np.testing.assert_array_equal(start.point, point)
+        assert (start.event, start.towards) == expected
+
+
 # -- a whole way ------------------------------------------------------------------------------------------------------
 
 
@@ -225,7 +234,7 @@ def test_an_agent_goes_from_event_to_event_and_counts_its_runs() -> None:
     steps = trip.go(60)
     assert trip.arrived()
     assert steps == 22  # eleven units of way in steps of half a unit
-    assert list(dict.fromkeys(trip.options)) == ["w1", "w2", "w3"]
+    assert list(dict.fromkeys(trip.options)) == ["w1", "w2", "direct"]
     assert [(run.event, run.option, run.landing) for run in trip.runs] == [("e0", "w1", "e1"), ("e1", "w2", "e2")]
     kept = record(trip.state)
     assert kept == {("e0", "w1", "e1", True): (1.0, 6.0), ("e1", "w2", "e2", True): (1.0, 8.0)}
@@ -353,11 +362,11 @@ def test_no_run_is_lost_when_there_are_more_kinds_than_are_told_apart() -> None:
         assert state.run_count.sum() == total
         assert state.run_steps.sum() == steps
     assert (state.run_option[0] != "").sum() == MAX_RUNS
-    assert runner.runs(state, 0).count.sum() == total
+    assert runner.runs(state, 0).number.sum() == total
     # The merged runs are still of their own option, where that one is told apart at all.
     before = runner.runs(state, 0)
     after = runner.runs(end_runs(runner, state, [("e3", "w5", (60.0, 0.0), 9)] * 7), 0)
-    assert (after.count - before.count)[before.target == 5].sum() == 7
+    assert (after.number - before.number)[before.target == 5].sum() == 7
 
 
 def test_a_state_is_never_changed_in_place() -> None:

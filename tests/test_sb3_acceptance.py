@@ -38,7 +38,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from sb3_skillgraph import SkillGraphAgent
 from sb3_skillgraph.runner import RunnerState
@@ -140,18 +140,6 @@ def test_vectorised_environments(n_envs: int, monitored: bool) -> None:
         check_store(agent, recorder.transitions, i)
     assert agent._episode_num == n_envs * (420 // n_envs // 40)
     assert agent.predict(agent.env.reset())[0].shape == (n_envs, 2)
-
-
-def test_worker_processes_give_the_same_as_one_process() -> None:
-    expected = without_clock(state_of(new_agent(new_vec_env()).learn(500)))
-    env = new_vec_env(vec_env_cls=SubprocVecEnv)
-    try:
-        agent = new_agent(env).learn(500)
-        assert differences(expected, without_clock(state_of(agent))) == []
-        rrt = new_agent(env, salience="rrt", learning_starts=50).learn(300)
-        assert rrt.num_timesteps == 300
-    finally:
-        env.close()
 
 
 @pytest.mark.mujoco

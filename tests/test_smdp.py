@@ -1,14 +1,15 @@
-"""Options as actions: the lifted environment, planning and Q-learning on it."""
+"""Options as actions: the lifted environment, and Q-learning on it. The options are those of deep covering options."""
 
 import copy
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from builders import make_option
-from conftest import TOY, new_agent
+from builders import make_factory, make_option
+from conftest import TOY
 from gymnasium import spaces
 from sb3_contrib import MaskablePPO
 from stable_baselines3.common.buffers import ReplayBuffer
@@ -16,21 +17,55 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from sb3_skillgraph import GraphPolicy, OptionsEnv, SkillGraphAgent, SMDPQLearning
+from sb3_skillgraph import OptionsEnv, SkillGraphAgent, SMDPQLearning
 from sb3_skillgraph.events import Event
+from sb3_skillgraph.memory.replay import TransitionStore
+from sb3_skillgraph.options.option import Option
 from sb3_skillgraph.smdp import FlatPolicy
 
 GAMMA = 0.9
+RADIUS = 0.45
+rests = pytest.mark.skip(reason="rests until skills are built on the graph of walks")
+
+
+class Towards:
+    """Stands in for a policy that has learned: it goes straight to where it is to go.
+
+    It is shown the observation, the achieved goal and, in radii, the way to the goal.
+    """
+
+    def act(self, seen: np.ndarray) -> np.ndarray:
+        return np.clip(seen[:, -2:] * RADIUS / 0.25, -1.0, 1.0)
+
+
+CENTERS = {"e0": (-1.0, 1.0), "e1": (0.0, 1.0), "e2": (1.0, 1.0), "e3": (1.0, 0.0)}
 
 
 @pytest.fixture(scope="module")
-def agent() -> SkillGraphAgent:
-    return new_agent().learn(2_500)
+def walker() -> Option:
+    """The option that walks to any goal."""
+    return made("global", None, None)
 
 
-def lifted(agent: SkillGraphAgent, **kwargs: Any) -> OptionsEnv:
+@pytest.fixture(scope="module")
+def options(walker: Option) -> list[Option]:
+    """Options along the upper half of the maze, from each event to its neighbours."""
+    events = {id: Event(id, np.array(center), RADIUS) for id, center in CENTERS.items()}
+    pairs = [("e0", "e1"), ("e1", "e2"), ("e2", "e3"), ("e3", "e2"), ("e2", "e1"), ("e1", "e0")]
+    return [made(f"o{i}", to, events[to], start=(CENTERS[begin], 0.5)) for i, (begin, to) in enumerate(pairs)]
+
+
+def made(id: str, target: str | None, termination: Event | None, **kwargs: Any) -> Option:
+    option = make_option(id, target, termination, **kwargs)
+    own = make_factory(TransitionStore(10, 2, 2, 2), radius=RADIUS).make(id, target, termination)
+    option.learner, option.radius = own.learner, RADIUS  # with a replay, whose view tells what it sees
+    option._actor = Towards()  # type: ignore[assignment]
+    return option
+
+
+def lifted(options: list[Option], walker: Option | None, **kwargs: Any) -> OptionsEnv:
     env = gym.make(TOY, terminate_on_success=True, max_steps=200)
-    return OptionsEnv(env, agent.options, **{"gamma": GAMMA, **kwargs})
+    return OptionsEnv(env, options, **{"gamma": GAMMA, "global_option": walker, **kwargs})
 
 
 def reset_somewhere(env: OptionsEnv, rng: np.random.Generator) -> dict[str, np.ndarray]:
@@ -52,11 +87,11 @@ class Steps(gym.Wrapper):
         return (result[0], self.rewards[-1], *result[2:])
 
 
-def test_one_action_is_one_run_of_an_option(agent: SkillGraphAgent) -> None:
+def test_one_action_is_one_run_of_an_option(options: list[Option], walker: Option) -> None:
     steps = Steps(gym.make(TOY, max_steps=150))
-    env = OptionsEnv(steps, agent.options, gamma=GAMMA)
+    env = OptionsEnv(steps, options, gamma=GAMMA, global_option=walker)
     assert env.action_space == spaces.Discrete(64)
-    rng, ran = np.random.default_rng(0), set()
+    rng, ran, n_successes = np.random.default_rng(0), set(), 0
     for _ in range(15):
         observation, over = reset_somewhere(env, rng), False
         while not over:
@@ -73,22 +108,24 @@ def test_one_action_is_one_run_of_an_option(agent: SkillGraphAgent) -> None:
             ran.add(info["option"])
             if action < len(env.options):
                 option = env.options[action]
-                assert info["option"] == option.id == agent.options[option.id].id
+                assert info["option"] == option.id
                 assert option.initiation.optimistic(start[None])[0]
                 assert info["tau"] <= env.timeout
                 assert info["option_success"] == option.terminates(observation["achieved_goal"])
+                n_successes += info["option_success"]
     assert {"global", "primitive 0", "primitive 4"} <= ran
-    assert any(id.startswith("o") for id in ran)
+    assert {option.id for option in options} <= ran
+    assert n_successes > 10
 
 
-def test_what_cannot_run_is_masked(agent: SkillGraphAgent) -> None:
+def test_what_cannot_run_is_masked(options: list[Option], walker: Option) -> None:
     event = Event("e0", np.array([1.0, 1.0]), 0.45)
-    options = [
+    some = [
         make_option("o1", "e0", event, start=((-1.0, 1.0), 0.5)),
         make_option("o2", "e0", event),  # gestates
         make_option("o3", "e0", event, start=((1.0, 1.0), 0.5)),  # ends where it starts
     ]
-    env = OptionsEnv(gym.make(TOY), options, global_option=agent.global_option, max_options=16)
+    env = OptionsEnv(gym.make(TOY), some, global_option=walker, max_options=16)
     with pytest.raises(ValueError, match="Call reset"):
         env.action_masks()
     always = np.arange(16) >= 10
@@ -98,7 +135,7 @@ def test_what_cannot_run_is_masked(agent: SkillGraphAgent) -> None:
     np.testing.assert_array_equal(env.action_masks(), always)
     with pytest.raises(ValueError, match="Action 1 cannot be taken here"):
         env.step(1)
-    options.append(make_option("o4", "e0", event, start=((1.0, -1.0), 0.5)))  # born meanwhile
+    some.append(make_option("o4", "e0", event, start=((1.0, -1.0), 0.5)))  # born meanwhile
     env.reset(options={"start": [1.0, -1.0]})
     assert env.action_masks()[3]
     assert env.index("o4") == 3
@@ -106,8 +143,8 @@ def test_what_cannot_run_is_masked(agent: SkillGraphAgent) -> None:
         env.index("o5")
 
 
-def test_primitive_actions(agent: SkillGraphAgent) -> None:
-    env = lifted(agent)
+def test_primitive_actions(options: list[Option], walker: Option) -> None:
+    env = lifted(options, walker)
     assert len(env.primitives) == 5  # both directions of both axes, and standing still
     start = np.array([-1.0, 1.0])
     for i, move in enumerate([(1, 0), (0, 1), (-1, 0), (0, -1), (0, 0)]):
@@ -115,12 +152,12 @@ def test_primitive_actions(agent: SkillGraphAgent) -> None:
         observation, _, _, _, info = env.step(env.first_fixed + 1 + i)
         np.testing.assert_allclose(observation["achieved_goal"] - start, 0.25 * np.array(move))
         assert (info["option"], info["tau"]) == (f"primitive {i}", 1)
-    own = lifted(agent, primitives=np.array([[0.5, -0.5]]), max_options=len(agent.options) + 2)
+    own = lifted(options, walker, primitives=np.array([[0.5, -0.5]]), max_options=len(options) + 2)
     own.reset(options={"start": start})
     np.testing.assert_allclose(own.step(own.max_options - 1)[0]["achieved_goal"] - start, [0.125, -0.125])
 
 
-def test_one_step_of_the_global_policy_where_actions_have_many_dimensions(agent: SkillGraphAgent) -> None:
+def test_one_step_of_the_global_policy_where_actions_have_many_dimensions(options: list[Option], walker: Option) -> None:
     class Legs(gym.ActionWrapper):
         """Eight numbers, the first two of which move."""
 
@@ -143,8 +180,8 @@ def test_one_step_of_the_global_policy_where_actions_have_many_dimensions(agent:
     assert info["tau"] == 1
 
 
-def test_the_global_option_walks_to_the_goal_or_along_a_route(agent: SkillGraphAgent) -> None:
-    env = lifted(agent)
+def test_the_global_option_walks_to_the_goal_or_along_a_route(options: list[Option], walker: Option) -> None:
+    env = lifted(options, walker)
     env.reset(options={"start": [-1.0, 1.0], "goal": [-1.0, 1.0 - 0.3]})
     _, reward, terminated, _, info = env.step(env.first_fixed)
     assert terminated
@@ -156,68 +193,57 @@ def test_the_global_option_walks_to_the_goal_or_along_a_route(agent: SkillGraphA
         asked.append((point.tolist(), goal.tolist()))
         return np.array([0.0, 1.0])
 
-    env = lifted(agent, route=route)
+    env = lifted(options, walker, route=route)
     env.reset(options={"start": [-1.0, 1.0], "goal": [1.0, -1.0]})
     observation, _, _, _, info = env.step(env.first_fixed)
     assert asked == [([-1.0, 1.0], [1.0, -1.0])]
     assert info["tau"] <= env.timeout // 2
     if info["option_success"]:
-        assert np.linalg.norm(observation["achieved_goal"] - [0.0, 1.0]) <= 0.5 * agent.event_radius
+        assert np.linalg.norm(observation["achieved_goal"] - [0.0, 1.0]) <= 0.5 * RADIUS
 
 
-def test_what_it_refuses(agent: SkillGraphAgent) -> None:
+def test_what_it_refuses(options: list[Option], walker: Option) -> None:
     with pytest.raises(ValueError, match="needs a goal environment"):
-        OptionsEnv(gym.make("CartPole-v1"), agent.options)
-    with pytest.raises(ValueError, match=r"global_option=agent\.global_option"):
+        OptionsEnv(gym.make("CartPole-v1"), options)
+    with pytest.raises(ValueError, match="neither primitive actions nor a global option"):
         OptionsEnv(gym.make(TOY), [], primitives=np.zeros((0, 2)))
     event = Event("e0", np.zeros(2), 0.45)
     many = [make_option(f"o{i}", "e0", event) for i in range(11)]
     with pytest.raises(ValueError, match=r"11 options and 6 actions .* max_options=16: give max_options=32"):
-        OptionsEnv(gym.make(TOY), many, global_option=agent.global_option, max_options=16)
+        OptionsEnv(gym.make(TOY), many, global_option=walker, max_options=16)
     with pytest.raises(ValueError, match="There is no global option"):
-        GraphPolicy(agent.planner, OptionsEnv(gym.make(TOY), many))
+        OptionsEnv(gym.make(TOY), many).global_action  # noqa: B018
 
 
-def test_the_global_option_may_be_among_the_options_or_missing(agent: SkillGraphAgent) -> None:
+def test_the_global_option_may_be_among_the_options_or_missing(options: list[Option], walker: Option) -> None:
     goal = {"start": [-1.0, 1.0], "goal": [-1.0, 0.7]}
-    listed = OptionsEnv(gym.make(TOY), [agent.global_option, *agent.options])
+    listed = OptionsEnv(gym.make(TOY), [walker, *options])
     listed.reset(options=goal)
     assert (listed.global_action, listed.first_fixed) == (0, 59)
     assert listed.action_masks()[0]
     assert listed.step(0)[-1]["option"] == "global"
-    without = OptionsEnv(gym.make(TOY), list(agent.options))
+    without = OptionsEnv(gym.make(TOY), list(options))
     without.reset(options=goal)
     assert without.action_masks()[-5:].all()
     assert without.first_fixed == 59
 
 
-def test_options_need_not_be_the_agents_list(agent: SkillGraphAgent) -> None:
-    """They bring along what their policies see."""
-    whole, part = lifted(agent), lifted(agent)
-    part.options = [option for option in agent.options if option.mature]
+def test_options_bring_along_what_their_policies_see(options: list[Option], walker: Option) -> None:
+    """An option's action may be another one in another environment; what it does is the same."""
+    whole, part = lifted(options, walker), lifted(options[2:], walker)
     for env in (whole, part):
-        env.reset(seed=0, options={"start": part.options[0].initiation.core})
-    action = whole.index(part.options[0].id)
-    if not whole.action_masks()[action]:
-        pytest.skip("it stands where the option leads")
-    there, here = whole.step(action), part.step(0)
+        env.reset(seed=0, options={"start": options[2].initiation.core, "goal": [-1.0, -1.0]})
+    there, here = whole.step(whole.index("o2")), part.step(0)
+    assert there[-1]["option"] == here[-1]["option"] == "o2"
+    assert there[-1]["option_success"] and there[-1]["tau"] > 1
     np.testing.assert_array_equal(there[0]["achieved_goal"], here[0]["achieved_goal"])
     with pytest.raises(ValueError, match="cannot be taken"):
         part.step(-1)
 
 
-def test_plans_with_options_that_are_not_among_the_actions(agent: SkillGraphAgent) -> None:
-    env = OptionsEnv(gym.make(TOY), [], global_option=agent.global_option)
-    policy = GraphPolicy(agent.planner, env)
-    rng = np.random.default_rng(0)
-    for _ in range(20):
-        action, _ = policy.predict(reset_somewhere(env, rng))
-        assert action == env.global_action
-
-
-def test_monitor_counts_decisions_and_seeds_repeat(agent: SkillGraphAgent) -> None:
+def test_monitor_counts_decisions_and_seeds_repeat(options: list[Option], walker: Option) -> None:
     def play(seed: int) -> list[Any]:
-        env, rng = Monitor(lifted(agent)), np.random.default_rng(seed)
+        env, rng = Monitor(lifted(options, walker)), np.random.default_rng(seed)
         observation, _ = env.reset(seed=seed)
         path, over, info = [observation["achieved_goal"].tolist()], False, {}
         while not over:
@@ -231,46 +257,65 @@ def test_monitor_counts_decisions_and_seeds_repeat(agent: SkillGraphAgent) -> No
     assert play(1) == play(1) != play(2)
 
 
-# -- two high levels --------------------------------------------------------------------------------------------------
+# -- high levels ------------------------------------------------------------------------------------------------------
 
 
-def test_the_graph_plans_on_it() -> None:
-    agent = new_agent(seed=3).learn(2_500)
-    env = lifted(agent, route=agent.planner.route)
-    policy = GraphPolicy(agent.planner, env)
-    env.reset(seed=0)
-    rewards, lengths = evaluate_policy(policy, Monitor(env), n_eval_episodes=20, return_episode_rewards=True)
-    assert len(rewards) == len(lengths) == 20
-    agent.planning = False
-    env.reset(seed=0)
-    straight, _ = evaluate_policy(agent, Monitor(env.env), n_eval_episodes=20, return_episode_rewards=True)
-    assert np.mean(np.array(rewards) > 0) >= 0.7  # 0.92 to 1.00 with three seeds of the agent
-    assert np.mean(np.array(rewards) > 0) >= np.mean(np.array(straight) > 0)
+@rests
+def test_the_options_of_an_agent_are_actions(trained: SkillGraphAgent) -> None:
+    env = OptionsEnv(gym.make(TOY, terminate_on_success=True, max_steps=200), trained.options, gamma=GAMMA)
+    rng, ran = np.random.default_rng(0), set()
+    for _ in range(5):
+        observation, over = reset_somewhere(env, rng), False
+        while not over:
+            action = int(rng.choice(np.flatnonzero(observation["action_mask"])))
+            observation, _, terminated, truncated, info = env.step(action)
+            ran.add(info["option"])
+            over = terminated or truncated
+    assert ran & {option.id for option in trained.options}
 
 
-def test_the_graph_remembers_failures_for_each_environment(agent: SkillGraphAgent) -> None:
-    env = lifted(agent, route=agent.planner.route)
-    policy = GraphPolicy(agent.planner, env)
-    one = reset_somewhere(env, np.random.default_rng(0))
-    batch = {key: np.stack([value, value]) for key, value in one.items()}
-    alone, state = policy.predict(one)
-    both, states = policy.predict(batch)
-    assert alone.shape == ()
-    assert both.tolist() == [alone, alone]
-    assert state is not None
-    assert states is not None
-    assert [x.shape for x in states] == [(2,)] * 3
-    again = policy.predict(batch, states, np.array([True, False]))[1]
-    assert again is not None
-    fresh, kept = np.array(again).T
-    assert fresh.tolist() == np.array(state).ravel().tolist()
-    assert kept.tolist() != fresh.tolist()  # it got nowhere, and knows
+@rests
+def test_the_graph_plans_on_it(trained: SkillGraphAgent) -> None:
+    """``GraphPolicy`` runs on an ``OptionsEnv`` the options that ``predict`` would run."""
+    from sb3_skillgraph.smdp import GraphPolicy  # type: ignore[attr-defined]
+
+    base = gym.make(TOY, terminate_on_success=True, max_steps=200)
+    env, rng = OptionsEnv(gym.make(TOY, terminate_on_success=True, max_steps=200), trained.options), np.random.default_rng(0)
+    policy = GraphPolicy(trained, env)
+    for _ in range(5):
+        where = {name: env.get_wrapper_attr("sample_free")(rng) for name in ("start", "goal")}
+        lifted_observation, _ = env.reset(options=where)
+        observation, _ = base.reset(options=where)
+        over, state, flat_state = False, None, None
+        while not over:
+            action, state = policy.predict(lifted_observation, state)
+            _, first = trained.predict(observation, flat_state)
+            lifted_observation, _, terminated, truncated, info = env.step(action)
+            assert trained.running(first) == [info["option"]]
+            for _ in range(info["tau"]):
+                move, flat_state = trained.predict(observation, flat_state)
+                observation = base.step(move)[0]
+            over = terminated or truncated
+            np.testing.assert_array_equal(observation["achieved_goal"], lifted_observation["achieved_goal"])
 
 
-def test_a_flat_policy_does_one_step_at_a_time_what_the_options_environment_does(agent: SkillGraphAgent) -> None:
-    env = lifted(agent, route=agent.planner.route)
-    policy, base = GraphPolicy(agent.planner, env), gym.make(TOY, terminate_on_success=True, max_steps=200)
-    flat, rng = FlatPolicy(policy, env), np.random.default_rng(3)
+class Turns:
+    """A high level that takes what can be done in turns, and remembers in its state how often it has chosen."""
+
+    def predict(
+        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = False
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
+        n_chosen = 0 if state is None else int(state[0][0])
+        allowed = np.flatnonzero(observation["action_mask"])
+        return allowed[7 * n_chosen % len(allowed)], (np.array([n_chosen + 1]),)
+
+
+def test_a_flat_policy_does_one_step_at_a_time_what_the_options_environment_does(
+    options: list[Option], walker: Option
+) -> None:
+    env, base = lifted(options, walker), gym.make(TOY, terminate_on_success=True, max_steps=200)
+    policy = Turns()
+    flat, rng, ran = FlatPolicy(policy, env), np.random.default_rng(3), set()
     for _ in range(5):
         where = {name: env.get_wrapper_attr("sample_free")(rng) for name in ("start", "goal")}
         observation, _ = env.reset(options=where)
@@ -278,16 +323,30 @@ def test_a_flat_policy_does_one_step_at_a_time_what_the_options_environment_does
         while not over:
             action, state = policy.predict(observation, state)
             observation, _, terminated, truncated, info = env.step(action)
+            ran.add(info["option"])
             n_steps, over = n_steps + info["tau"], terminated or truncated
         plain, _ = base.reset(options=where)
-        over, state = False, None
+        over, flat_state = False, None
         for _ in range(n_steps):
             assert not over
-            action, state = flat.predict(plain, state)
-            plain, _, terminated, truncated, _ = base.step(action)
+            move, flat_state = flat.predict(plain, flat_state)
+            plain, _, terminated, truncated, _ = base.step(move)
             over = terminated or truncated
         assert over
         np.testing.assert_array_equal(plain["achieved_goal"], observation["achieved_goal"])
+    assert len(ran) > 6
+
+
+def test_a_flat_policy_forgets_where_an_episode_begins(options: list[Option], walker: Option) -> None:
+    env = lifted(options, walker)
+    flat = FlatPolicy(Turns(), env)
+    observation, _ = env.reset(options={"start": [-1.0, 1.0], "goal": [1.0, -1.0]})
+    plain = {key: value for key, value in observation.items() if key != "action_mask"}
+    _, state = flat.predict(plain)
+    _, later = flat.predict(plain, state)
+    _, anew = flat.predict(plain, later, np.array([True]))
+    assert [int(each[1][0]) for each in (state, later, anew)] == [1, 2, 1]
+    assert state[0].item().id == anew[0].item().id
 
 
 class SmallSMDP(gym.Env):
@@ -378,8 +437,8 @@ def test_the_target_network_values_what_the_other_chooses() -> None:
     assert not any("followed" in name for name in policy.state_dict())
 
 
-def test_q_learning_learns_on_options_and_is_saved(agent: SkillGraphAgent, tmp_path: Any) -> None:
-    env = Monitor(lifted(agent))
+def test_q_learning_learns_on_options_and_is_saved(options: list[Option], walker: Option, tmp_path: Path) -> None:
+    env = Monitor(lifted(options, walker))
     model = SMDPQLearning("MultiInputPolicy", env, learning_starts=50, train_freq=1, gamma=GAMMA, seed=0).learn(300)
     assert model._n_updates > 200
     assert (model.replay_buffer.discounts[:300] < GAMMA + 1e-6).all()  # type: ignore[union-attr]
@@ -401,8 +460,8 @@ def test_q_learning_without_masks_and_what_it_refuses() -> None:
         SMDPQLearning("MlpPolicy", "CartPole-v1", replay_buffer_class=ReplayBuffer)
 
 
-def test_maskable_ppo_trains_on_it(agent: SkillGraphAgent) -> None:
-    env = Monitor(lifted(agent))
+def test_maskable_ppo_trains_on_it(options: list[Option], walker: Option) -> None:
+    env = Monitor(lifted(options, walker))
     model = MaskablePPO("MultiInputPolicy", env, n_steps=64, batch_size=32, n_epochs=2, seed=0)
     before = copy.deepcopy(model.policy.state_dict())
     model.learn(128)

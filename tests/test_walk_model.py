@@ -169,3 +169,14 @@ def test_a_restored_model_expects_the_same() -> None:
     np.testing.assert_array_equal(restored.steps(asked), model.steps(asked))
     np.testing.assert_array_equal(restored.is_hasty(asked), model.is_hasty(asked))
     np.testing.assert_array_equal(restored.loss, model.loss)
+
+
+def test_a_state_is_no_view_of_the_model() -> None:
+    model, restored = fitted((SHORT, 30.0, 5.0), (LONG, 3.0, 30.0)), WalkModel()
+    state = model.get_state()
+    restored.set_state(state)
+    before = copy.deepcopy(state)
+    for changed in (model, restored):
+        for array in (changed.loss, changed.pace, changed.coefficients, changed.mean, changed.scale):
+            array += 0.5
+        np.testing.assert_equal(state, before)

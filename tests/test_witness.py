@@ -126,6 +126,18 @@ def test_a_detour_is_no_way() -> None:
     assert found["e1", "e0"] == (1.0, 2.0, 1.0)
 
 
+def test_where_an_episode_ends_has_been_crossed_to_as_well() -> None:
+    witness = make_witness()
+    walk(witness, straight(4.5))
+    assert ("e1", "e2") not in forward(witness.graph)  # it might still come nearer
+    witness.begin(0, np.array([20.0, 0.0]))
+    assert crossings(witness.graph)["e1", "e2"] == (1.0, 0.0, 4.0)
+    assert crossings(witness.graph)["e0", "e2"] == (1.0, 0.0, 8.0)
+    known = crossings(witness.graph)
+    witness.begin(0, np.array([0.0, 0.0]))  # who has not moved has crossed nothing
+    assert crossings(witness.graph) == known
+
+
 def test_nobody_crosses_from_one_episode_into_the_next() -> None:
     witness = make_witness()
     walk(witness, [0.0, 0.5, 0.0])
@@ -255,7 +267,7 @@ def test_a_run_that_belongs_to_no_edge_makes_none(ended: Run) -> None:
 
 def test_hasty_crossings_are_learned_to_fail() -> None:
     witness = make_witness()
-    walk(witness, [*straight(20.0), 22.0])  # four steps from landmark to landmark
+    walk(witness, straight(22.0))  # four steps from landmark to landmark
     graph, model = witness.graph, witness.choice_model.model
     n = len(graph.events)
     for k in range(4):  # one who falls: in a single step
@@ -283,7 +295,7 @@ def test_hasty_crossings_are_learned_to_fail() -> None:
     untried_slow, untried_fast = graph.edges.find(*slow[-1]), graph.edges.find(*fast[-1])
     assert success[untried_slow] > 0.7
     assert alike[untried_fast] < 0.2
-    assert success[untried_fast] < success[untried_slow] - 0.2
+    assert success[untried_fast] < 0.2
     assert model.loss[0] > HASTY_LOSS  # they were lost
     assert model.loss[1] == 0.0
 

@@ -60,12 +60,16 @@ class OGBenchMazeEnv(GoalTask):
             raise ValueError(f"there is no maze of OGBench {name!r} for a point or an ant, such as 'pointmaze-giant-v0'")
         self._skip, self.option_view, self.body_radius = _BODIES[kind]
         self.start_margin = 0.5 * self.body_radius
-        with private_temporary_directory():  # OGBench leaves the model's file behind
-            maze: Any = gym.make(name, terminate_at_goal=False).unwrapped
+        try:
+            with private_temporary_directory():  # OGBench leaves the model's file behind
+                maze: Any = gym.make(name, terminate_at_goal=False).unwrapped
+        except gym.error.Error as error:
+            raise ValueError(f"OGBench has no maze {name!r}") from error
         self.maze = maze
         self.render_mode = render_mode
+        radius = self.maze._goal_tol if success_radius is None else success_radius
         self.action_space = self.maze.action_space
-        self._init_task(self._geometry(), success_radius or self.maze._goal_tol, max_steps, terminate_on_success)
+        self._init_task(self._geometry(), radius, max_steps, terminate_on_success)
         n_numbers = len(self.maze.get_ob()) - self._skip
         position, body = (spaces.Box(-np.inf, np.inf, (n,), np.float64) for n in (2, n_numbers))
         self.observation_space = spaces.Dict({"observation": body, "achieved_goal": position, "desired_goal": position})

@@ -199,7 +199,7 @@ class Witness:
             "n_steps": self._n_steps,
             "stays": [[[stay.event, stay.step, stay.distance] for stay in stays] for stays in self._stays],
             "step": list(self._step),
-            "began": self._began,
+            "began": self._began.copy(),
         }
 
     def set_state(self, state: dict[str, Any]) -> None:

@@ -168,8 +168,11 @@ class TransitionStore:
 
         :raises ValueError: if the stored rows do not fit this store
         """
-        if "stuck" not in state:
-            raise ValueError("The replay buffer was saved by an older version, which did not know of agents that get stuck.")
+        expected = self.get_state().keys()
+        if state.keys() != expected or not isinstance(state["columns"], dict) or set(state["columns"]) != set(_COLUMNS):
+            raise ValueError(
+                f"A stored replay buffer has the entries {', '.join(expected)}; here are {', '.join(map(str, state))}."
+            )
         for name in ("n_envs", "capacity"):
             if state[name] != getattr(self, name):
                 raise ValueError(
@@ -177,12 +180,12 @@ class TransitionStore:
                     "load it into an agent made with the same buffer_size and number of environments."
                 )
         for name in _COLUMNS:
-            own = self._data[:1, self._slices[name]].shape[1:]
-            if state["columns"][name].shape[1:] != own:
+            own, stored = self._data[:1, self._slices[name]].shape[1:], np.shape(state["columns"][name])[1:]
+            if stored != own:
                 raise ValueError(
-                    f"The stored replay buffer has {name} of shape {state['columns'][name].shape[1:]}, this agent's "
-                    f"environment gives {own}."
+                    f"The stored replay buffer has {name} of shape {stored}, this agent's environment gives {own}."
                 )
+        self._check_rows(state)
         self.total = int(state["total"])
         at = np.arange(self.oldest, self.total) % self.capacity
         for name in _COLUMNS:
@@ -195,6 +198,25 @@ class TransitionStore:
         self._last_row = np.array(state["last_row"])
         if len(self._last_row) == 0:
             self._last_row = np.full(1024, -1, dtype=np.int64)
+
+    def _check_rows(self, state: dict[str, Any]) -> None:
+        """Refuse rows and counters that do not belong together."""
+        total, n_trajectories = state["total"], state["n_trajectories"]
+        if not (isinstance(total, int) and isinstance(n_trajectories, int) and 0 <= total < 2**62 and n_trajectories >= 0):
+            raise ValueError(f"The stored replay buffer counts {total!r} rows of {n_trajectories!r} trajectories.")
+        n = min(total, self.capacity)
+        shapes = {"terminated": (n,), "stuck": (n,), "trajectory": (n,), "current": (self.n_envs,)}
+        for name, shape in shapes.items():
+            if np.shape(state[name]) != shape or np.asarray(state[name]).dtype.kind not in "bi":
+                raise ValueError(f"The stored replay buffer has no {name} of shape {shape}.")
+        if any(len(state["columns"][name]) != n for name in _COLUMNS):
+            raise ValueError(f"The columns of the stored replay buffer have not {n} rows each.")
+        last = np.asarray(state["last_row"])
+        if last.ndim != 1 or last.dtype.kind != "i" or len(last) > n_trajectories:
+            raise ValueError(f"The stored replay buffer has no last rows of {n_trajectories} trajectories.")
+        numbers = np.concatenate([state["trajectory"], state["current"]])
+        if n and not (numbers.min() >= 0 and np.asarray(state["trajectory"]).max() < len(last) and last.max() < total):
+            raise ValueError("The trajectories of the stored replay buffer are not those of its rows.")
 
 
 def as_rows(before: dict[str, np.ndarray], action: np.ndarray, after: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

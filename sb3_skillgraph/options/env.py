@@ -11,6 +11,7 @@ from sb3_skillgraph.options.execution import Fate, fate
 from sb3_skillgraph.options.initiation import InitiationSet
 from sb3_skillgraph.options.option import Option, termination_rule
 from sb3_skillgraph.options.views import ScaledView, View, as_view
+from sb3_skillgraph.options.walk import Walk
 
 
 class OptionEnv(gym.Wrapper):
@@ -23,7 +24,7 @@ class OptionEnv(gym.Wrapper):
     episode is over or has not begun.
 
     :param env: a goal environment (Dict observations, Box actions)
-    :param termination: the salient event the option leads to, or the option into whose initiation set it leads
+    :param termination: the event the option leads to, a walk to it, or the option into whose initiation set it leads
     :param initiation: where the option can start; ``info["can_start"]`` tells after each reset whether it can
     :param timeout: environment steps per run
     :param goal: the point the policy aims at, shape ``(goal_dim,)``; by default that of the termination set
@@ -35,7 +36,7 @@ class OptionEnv(gym.Wrapper):
     def __init__(
         self,
         env: gym.Env,
-        termination: Event | Option,
+        termination: Event | Option | Walk,
         *,
         initiation: InitiationSet | None = None,
         timeout: int = 200,
@@ -49,6 +50,8 @@ class OptionEnv(gym.Wrapper):
                 f"OptionEnv needs a goal environment: a Dict observation with 'observation', 'achieved_goal' and "
                 f"'desired_goal', not {space}."
             )
+        if isinstance(termination, Walk):
+            termination = termination.termination
         self.termination = termination
         self.initiation = initiation
         self.timeout = timeout

@@ -76,7 +76,7 @@ def plot_skill_graph(agent: SkillGraphAgent, geometry: MazeGeometry | None = Non
     :return: the axes
     """
     axes = figures.new_axes() if ax is None else ax
-    centers = np.array([event.center for event in agent.events]).reshape(len(agent.events), -1)
+    centers = agent.graph.centers
     figures.draw_floor(axes, geometry, centers if len(centers) else np.zeros((1, 2)), 2 * agent.event_radius)
     _draw_links(axes, agent, near_links(event_links(agent)))
     _draw_events(axes, agent)
