@@ -16,7 +16,7 @@ from sb3_skillgraph.learning.missions import Missions
 from sb3_skillgraph.learning.rollout import Rollout
 from sb3_skillgraph.learning.salience import FrontierSalience, RandomSalience, Salience
 from sb3_skillgraph.learning.witness import Witness
-from sb3_skillgraph.memory.replay import TransitionStore
+from sb3_skillgraph.memory.store import TransitionStore
 from sb3_skillgraph.options.factory import OptionFactory
 from sb3_skillgraph.options.learner import OptionDDPG, OptionLearner, OptionTD3
 from sb3_skillgraph.options.option import Option

@@ -18,7 +18,7 @@ from stable_baselines3.common.save_util import recursive_getattr
 from stable_baselines3.common.utils import check_for_correct_spaces
 
 from sb3_skillgraph.goal_env import refuse_vec_normalize
-from sb3_skillgraph.memory.replay import TransitionStore
+from sb3_skillgraph.memory.store import TransitionStore
 from sb3_skillgraph.options.learner import OptionDDPG, OptionTD3
 from sb3_skillgraph.saving import MissingCallable, PathOrFile, known_class, load_tree
 

@@ -10,7 +10,7 @@ from gymnasium import spaces
 from hypothesis import HealthCheck, Phase, settings
 
 from sb3_skillgraph.events import TerminationSet
-from sb3_skillgraph.memory.replay import TransitionStore
+from sb3_skillgraph.memory.store import TransitionStore
 from sb3_skillgraph.options.factory import OptionFactory
 from sb3_skillgraph.options.initiation import Boundary
 from sb3_skillgraph.options.learner import OptionDDPG

@@ -23,6 +23,7 @@ FLOORS: dict[str, float] = {
     "memory": 2,
     "options": 3,  # initiation sets, policies, termination sets
     "goal_env": 3.5,  # what an environment tells, its view of options among it
+    "edges": 3,  # records of runs, as arrays
     "graph": 4,
     "walk_model": 5,
     "choices": 6,
@@ -43,7 +44,6 @@ FLOORS: dict[str, float] = {
     "training": 13,
     "experiments": 14,
     "cli": 15,
-    "__main__": 16,
     "__init__": 16,
 }
 
@@ -94,8 +94,8 @@ def breaches(path: Path, tree: ast.Module) -> list[str]:
     ]
 
 
-def test_every_module_has_a_floor() -> None:
-    assert {room(path) for path in FILES} <= FLOORS.keys()
+def test_every_module_has_a_floor_and_every_floor_a_module() -> None:
+    assert {room(path) for path in FILES} == FLOORS.keys()
 
 
 @pytest.mark.parametrize("path", FILES, ids=NAMES)

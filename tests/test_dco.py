@@ -13,7 +13,7 @@ from sb3_skillgraph import SkillGraphAgent
 from sb3_skillgraph.graph import SkillGraph
 from sb3_skillgraph.learning import dco
 from sb3_skillgraph.learning.dco import LEARN_EVERY, DCOSalience, FiedlerEmbedding
-from sb3_skillgraph.memory.replay import TransitionStore
+from sb3_skillgraph.memory.store import TransitionStore
 
 
 def grid(width: int, height: int, walls: set[tuple[int, int]] = frozenset()) -> tuple[np.ndarray, np.ndarray]:

@@ -1,10 +1,10 @@
-"""The examples run as they are, with fewer steps."""
+"""The examples run as they are, with fewer steps; so do the benchmarks that nothing else runs."""
 
+import importlib
 import re
 import runpy
 import sys
 from pathlib import Path
-from typing import Any
 
 import gymnasium as gym
 import mujoco
@@ -13,6 +13,8 @@ import pytest
 from conftest import TOY
 
 from sb3_skillgraph import SkillGraphAgent
+from sb3_skillgraph.experiments import RunSpec
+from sb3_skillgraph.experiments import run as do_run
 
 Capture = pytest.CaptureFixture[str]
 EXAMPLES = Path(__file__).parent.parent / "examples"
@@ -70,3 +72,41 @@ def test_ant_to_any_goal(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys
     with pytest.raises(SystemExit):
         run(monkeypatch, "ant_to_any_goal.py", tmp_path / "agent.zip", "--goal", 0, 0)
     assert "reset option 'goal' is" in capsys.readouterr().err
+
+
+# -- benchmarks -------------------------------------------------------------------------------------------------------
+
+ROOT = EXAMPLES.parent
+BENCHMARKS = sorted(path.stem for path in (ROOT / "benchmarks").glob("*.py") if path.stem != "__init__")
+
+
+@pytest.mark.parametrize("name", BENCHMARKS)
+def test_a_benchmark_can_be_imported(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(ROOT))
+    assert callable(importlib.import_module(f"benchmarks.{name}").main)
+
+
+@pytest.mark.mujoco
+def test_throughput_tells_the_parts_of_a_step(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(ROOT))
+    throughput = importlib.import_module("benchmarks.throughput")
+    row = throughput.measure(throughput.Case("point", (16, 16), 16, 1), 300, 40, 1)
+    assert row["events"] >= 1
+    for times in (row["sb3"], row["ours"]):
+        assert times["total"] == pytest.approx(sum(times[part] for part in throughput.PARTS), abs=1e-3)
+        assert min(times.values()) > 0.0
+
+
+@pytest.mark.mujoco
+def test_ants_are_tested_with_plans_and_straight_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(ROOT))
+    ants = importlib.import_module("benchmarks.ants")
+    monkeypatch.setattr(ants, "N_PAIRS", 1)
+    monkeypatch.setattr(ants, "N_FAR", 1)
+    monkeypatch.setattr(ants, "N_LAST", 50)
+    spec = RunSpec("dsg", "ant", 0, "skill_graph", "SkillGraph/AntUMaze-v0", 60, 60, 1, 1, env_kwargs={"max_steps": 20})
+    assert do_run(spec, tmp_path) == "done", (spec.folder(tmp_path) / "error.txt").read_text()
+    result = ants.test_run(spec.folder(tmp_path))
+    assert {kind: len(walks) for kind, walks in result["walks"].items()} == dict.fromkeys(ants.WALKS, 1)
+    assert all(1 <= walks[0]["steps"] <= 20 for walks in result["walks"].values())
+    assert all(0.0 < share < 1.0 for share in result["cells"].values())

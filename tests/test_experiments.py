@@ -1,5 +1,7 @@
 """Many runs on disk: what is skipped, resumed, refused and reported."""
 
+import csv
+import importlib
 import json
 import os
 import shutil
@@ -68,6 +70,13 @@ def test_the_plans_of_the_benchmarks_can_be_read(file: Path) -> None:
     assert load_plan(file)
 
 
+def test_what_the_benchmarks_compare_is_in_their_plans(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(PLANS[0].parents[1]))
+    order = importlib.import_module("benchmarks.compare_table").ORDER
+    methods = {spec.method for file in PLANS for spec in load_plan(file)}
+    assert {method for pair in order for method in pair} <= methods
+
+
 # -- one run ----------------------------------------------------------------------------------------------------------
 
 
@@ -80,7 +89,7 @@ def test_a_run_leaves_everything_and_is_not_done_again(
     monkeypatch.setattr(runner, "STRETCH", 150)
     arguments: dict[str, dict[str, Any]] = {
         "covering_options": {"n_options": 2, "option_updates": 20, "batch_size": 32},
-        **dict.fromkeys(("uvfa", "her"), {"buffer_size": 2_000}),  # SB3 saves and loads all of it
+        **{name: {"buffer_size": 2_000} for name in ("uvfa", "her")},  # SB3 saves and loads all of it
     }
     changes = {"arguments": arguments[algorithm]} if algorithm in arguments else {}
     this = spec(algorithm, steps=400, test_pairs=2, test_stretches=1, **changes)
@@ -490,6 +499,22 @@ def test_stored_results_without_agents_say_so(
     assert main(["figure", "6", *command]) == 0
     assert main(["figure", "3", *command]) == 2
     assert "no finished run of a skill graph" in capsys.readouterr().err
+
+
+def test_the_benchmarks_table_sums_up_what_is_done(
+    runs: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.syspath_prepend(str(PLANS[0].parents[1]))
+    table = importlib.import_module("benchmarks.compare_table")
+    monkeypatch.setattr(sys, "argv", ["compare_table", *map(str, runs)])
+    table.main()
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 2 + 3
+    with (runs[1] / "plan_summary.csv").open() as file:
+        rows = {row["method"]: float(row["mean"]) for row in csv.DictReader(file)}
+    done = {s.method: json.loads((s.folder(runs[1]) / "done.json").read_text())["success_rate"] for s in load_plan(runs[0])}
+    assert rows == pytest.approx(done, abs=1e-4)
+    assert list(rows.values()) == sorted(rows.values(), reverse=True)
 
 
 def test_compare_and_status_on_the_command_line(runs: tuple[Path, Path], capsys: pytest.CaptureFixture[str]) -> None:

@@ -13,7 +13,7 @@ from sb3_skillgraph.learning.missions import MAX_FAILURES, Mission, Missions
 from sb3_skillgraph.learning.rollout import HOLD, Rollout
 from sb3_skillgraph.learning.salience import MARGIN, FrontierSalience, RandomSalience
 from sb3_skillgraph.learning.witness import Witness
-from sb3_skillgraph.memory.replay import TransitionStore
+from sb3_skillgraph.memory.store import TransitionStore
 from sb3_skillgraph.planning import Planner
 from sb3_skillgraph.runner import Run, Runner
 from sb3_skillgraph.walk_model import WalkModel

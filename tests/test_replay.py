@@ -12,7 +12,8 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
 from sb3_skillgraph.envs import ToyMazeEnv
 from sb3_skillgraph.events import Event
-from sb3_skillgraph.memory.replay import OptionReplay, OptionRule, TransitionStore
+from sb3_skillgraph.memory.replay import OptionReplay, OptionRule
+from sb3_skillgraph.memory.store import TransitionStore
 from sb3_skillgraph.options.env import OptionEnv
 from sb3_skillgraph.options.option import goal_rule, termination_rule
 from sb3_skillgraph.options.views import ScaledView, relative_view

@@ -19,7 +19,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_skillgraph import OptionsEnv, SkillGraphAgent, SMDPQLearning
 from sb3_skillgraph.events import Event
-from sb3_skillgraph.memory.replay import TransitionStore
+from sb3_skillgraph.memory.store import TransitionStore
 from sb3_skillgraph.options.option import Option
 from sb3_skillgraph.smdp import FlatPolicy
 

@@ -18,7 +18,7 @@ from sb3_skillgraph.baselines.covering_replay import CoveringReplay, Everywhere,
 from sb3_skillgraph.baselines.goal_conditioned import GoalSchedule
 from sb3_skillgraph.goal_env import GoalSpec
 from sb3_skillgraph.learning.dco import learn_fiedler
-from sb3_skillgraph.memory.replay import TransitionStore, as_rows
+from sb3_skillgraph.memory.store import TransitionStore, as_rows
 from sb3_skillgraph.options.factory import OptionFactory, copy_policy
 from sb3_skillgraph.options.learner import OptionDDPG, OptionTD3
 from sb3_skillgraph.options.option import Option

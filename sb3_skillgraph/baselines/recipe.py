@@ -13,7 +13,7 @@ from sb3_skillgraph.agent import SkillGraphAgent
 from sb3_skillgraph.baselines.straight_on import StraightOn
 from sb3_skillgraph.goal_env import as_batch
 from sb3_skillgraph.learning.missions import Mission
-from sb3_skillgraph.memory.replay import as_rows
+from sb3_skillgraph.memory.store import as_rows
 
 
 class NewGoals(gym.Wrapper):

@@ -8,7 +8,7 @@ import torch as th
 from stable_baselines3.common.torch_layers import create_mlp
 
 from sb3_skillgraph.graph import SkillGraph
-from sb3_skillgraph.memory.replay import TransitionStore
+from sb3_skillgraph.memory.store import TransitionStore
 
 #: Environment steps between two embeddings, each of which takes half a second to learn.
 LEARN_EVERY = 5_000

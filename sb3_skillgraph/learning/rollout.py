@@ -8,7 +8,7 @@ from stable_baselines3.common.noise import ActionNoise
 from sb3_skillgraph.choices import OPTIMISTIC
 from sb3_skillgraph.learning.missions import Mission, Missions
 from sb3_skillgraph.learning.witness import Witness
-from sb3_skillgraph.memory.replay import TransitionStore
+from sb3_skillgraph.memory.store import TransitionStore
 from sb3_skillgraph.planning import DIRECT
 from sb3_skillgraph.runner import Runner, RunnerState
 

@@ -11,7 +11,8 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_skillgraph.events import TerminationSet
-from sb3_skillgraph.memory.replay import OptionReplay, TransitionStore
+from sb3_skillgraph.memory.replay import OptionReplay
+from sb3_skillgraph.memory.store import TransitionStore
 from sb3_skillgraph.options.option import Option, goal_rule, termination_rule
 from sb3_skillgraph.options.views import ScaledView
 
