@@ -29,7 +29,7 @@ from sb3_skillgraph.options.option import goal_rule
 
 CORRIDOR = [[1] * 6, [1, "r", 0, 0, 0, 1], [1] * 6]
 SHORT_CORRIDOR: dict[str, Any] = {"maze_map": CORRIDOR, "max_steps": 60}
-SMALL_NETS: dict[str, Any] = dict(policy_kwargs={"net_arch": [32, 32]}, batch_size=64, learning_rate=2e-3)
+SMALL_NETS: dict[str, Any] = dict(buffer_size=5_000, policy_kwargs={"net_arch": [32, 32]}, batch_size=64, learning_rate=2e-3)
 
 
 def toy(**kwargs: object) -> gym.Env:
@@ -47,13 +47,13 @@ def test_a_goal_is_kept_for_some_episodes() -> None:
 
 def test_the_goal_conditioned_baselines_give_up_when_stuck() -> None:
     for make in (make_uvfa, make_her):
-        (env,) = make(Sinks(toy()), seed=0).get_env().envs
+        (env,) = make(Sinks(toy()), seed=0, buffer_size=100).get_env().envs
         env.reset(options={"start": [-1.0, 1.0], "goal": [1.0, 1.0]})
         assert [env.step(np.zeros(2, dtype=np.float32))[2] for _ in range(3)] == [False, False, True]
 
 
 def test_the_goal_conditioned_baselines_are_sb3s_own() -> None:
-    uvfa, her = make_uvfa(toy(), seed=0, goal_freq=5), make_her(toy(), seed=0, batch_size=64)
+    uvfa, her = make_uvfa(toy(), seed=0, goal_freq=5, buffer_size=2_000), make_her(toy(), seed=0, batch_size=64)
     assert type(uvfa) is type(her) is DDPG
     assert isinstance(her.replay_buffer, HerReplayBuffer)
     assert her.batch_size == 64

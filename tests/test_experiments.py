@@ -293,7 +293,7 @@ from sb3_skillgraph.experiments import compare, load_plan, runner
 
 plan, out, rounds = Path(sys.argv[1]), Path(sys.argv[2]), json.loads(sys.argv[3])
 
-def work(place, left):
+def work(turn, place, left):
     def killed_in_time(call):
         def counted(*arguments, **kwargs):
             nonlocal left
@@ -314,20 +314,20 @@ def work(place, left):
 
     def noted(self):
         with (out / "begun.txt").open("a") as file:
-            file.write(f"{self.folder.name}\\n")
+            file.write(f"{turn} {self.folder.name}\\n")
         do(self)
 
     runner._Run.do = noted
     compare(load_plan(plan), out)
 
 ends = []
-for workers in rounds:  # those of one round at the same time
+for turn, workers in enumerate(rounds):  # those of one round at the same time
     begun = []
     for worker in workers:
         begun.append(os.fork())
         if begun[-1] == 0:
             try:
-                work(*worker)
+                work(turn, *worker)
                 os._exit(0)
             finally:
                 os._exit(1)
@@ -353,12 +353,12 @@ def test_killed_at_any_moment_it_comes_to_the_same_and_two_workers_share(tmp_pat
     shared.mkdir()
     steps = np.random.default_rng(0).integers(120, 300, 3).tolist()
     deaths = [*(("step", n) for n in steps), ("write", 2), ("save", 2), ("test", 90)]
-    assert work(file, shared, [[death] for death in deaths]) == [[-signal.SIGKILL]] * len(deaths)
-    unfinished = [s.spec.folder(shared).name for s in status(specs, shared) if s.state != "done"]
-    assert unfinished
-    (shared / "begun.txt").unlink()
-    assert work(file, shared, [[("step", 0), ("step", 0)]]) == [[0, 0]]
-    assert sorted((shared / "begun.txt").read_text().split()) == unfinished  # each by one of them
+    rounds = [*([death] for death in deaths), [("step", 0), ("step", 0)]]
+    assert work(file, shared, rounds) == [[-signal.SIGKILL]] * len(deaths) + [[0, 0]]
+    lines = [line.split() for line in (shared / "begun.txt").read_text().splitlines()]
+    assert {int(turn) for turn, _ in lines} == set(range(len(rounds)))
+    last = [name for turn, name in lines if int(turn) == len(deaths)]
+    assert len(set(last)) == len(last)  # each by one of the two
     for s in specs:
         assert (s.folder(shared) / "done.json").exists()
         assert not (s.folder(shared) / "error.txt").exists()
@@ -449,6 +449,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 @pytest.mark.parametrize("number", [3, 4, 5, 6, 9])
 def test_figures_of_the_paper(number: int, runs: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(figures, "N_PAIRS", 1_000)
+    monkeypatch.setattr(figures, "SHARES", (0.5, 1.0))
     file, out = runs
     picture = tmp_path / "figure.png"
     assert main(["figure", str(number), str(file), "--out", str(out), "--to", str(picture)]) == 0

@@ -140,11 +140,6 @@ class Adam:
         """:return: what the optimiser learns"""
         return self.optimizer.param_groups[0]["params"]
 
-    @property
-    def moments(self) -> list[th.Tensor]:
-        """:return: the counts and running averages, as they are now"""
-        return [*self._counts, *self._averages, *self._squares]
-
     def follow(self) -> None:
         """Notice when ``load_state_dict`` has put another state in place of the one in use."""
         state = self.optimizer.state
@@ -232,13 +227,6 @@ class FastUpdate:
         """Use what was loaded into the optimisers since the last gradient step."""
         self.actor_adam.follow()
         self.critic_adam.follow()
-
-    def constants(self) -> tuple[Any, ...]:
-        """Return all that a record of a gradient step would take for constant: where things lie, and learning rates."""
-        adams = (self.actor_adam, self.critic_adam)
-        tensors = [x for adam in adams for x in (*adam.parameters, *adam.moments)]
-        tensors += self._critic_targets + self._actor_target
-        return *(x.data_ptr() for x in tensors), *(adam.optimizer.param_groups[0]["lr"] for adam in adams)
 
     def step(self, data: ReplayBufferSamples, settings: StepSettings, with_actor: bool) -> tuple[th.Tensor, th.Tensor | None]:
         """

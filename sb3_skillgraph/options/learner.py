@@ -13,7 +13,6 @@ from stable_baselines3.ddpg.ddpg import DDPG
 from stable_baselines3.td3.policies import TD3Policy
 from stable_baselines3.td3.td3 import TD3
 
-from sb3_skillgraph.options.cuda_graph import GraphedUpdate
 from sb3_skillgraph.options.fast_update import FastUpdate, StepSettings, why_not
 
 
@@ -58,7 +57,7 @@ class OptionLearner(TD3):
         self.actor_learning_rate = actor_learning_rate
         self.critic_learning_rate = critic_learning_rate
         self.saturation_penalty = saturation_penalty
-        self._fast_update: FastUpdate | GraphedUpdate | None = None
+        self._fast_update: FastUpdate | None = None
         super().__init__(policy, env, learning_rate=critic_learning_rate, **kwargs)  # type: ignore[arg-type]
 
     def _setup_model(self) -> None:
@@ -100,7 +99,7 @@ class OptionLearner(TD3):
                 self.logger.record(name, sum(loss.item() for loss in losses) / len(losses))
 
     def _gradient_steps(
-        self, fast: FastUpdate | GraphedUpdate, gradient_steps: int, batch_size: int
+        self, fast: FastUpdate, gradient_steps: int, batch_size: int
     ) -> tuple[list[th.Tensor], list[th.Tensor]]:
         assert self.replay_buffer is not None
         settings = StepSettings(
@@ -116,7 +115,7 @@ class OptionLearner(TD3):
                 actor_losses.append(actor_loss)
         return actor_losses, critic_losses
 
-    def _find_fast_update(self) -> FastUpdate | GraphedUpdate | None:
+    def _find_fast_update(self) -> FastUpdate | None:
         if self._fast_update is not None and self._fast_update.policy is self.policy:
             self._fast_update.follow()
             return self._fast_update
@@ -124,8 +123,7 @@ class OptionLearner(TD3):
         if reason is not None:
             _warn_once(reason, bool(self.saturation_penalty))
             return None
-        fast = FastUpdate(self.policy)
-        self._fast_update = GraphedUpdate(fast) if self.device.type == "cuda" else fast
+        self._fast_update = FastUpdate(self.policy)
         return self._fast_update
 
     def _excluded_save_params(self) -> list[str]:
