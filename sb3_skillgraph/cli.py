@@ -229,7 +229,7 @@ def _demo(args: argparse.Namespace) -> int:
     assert isinstance(agent.action_space, gym.spaces.Box)
     methods: dict[str, Predictor] = {
         "skill graph": agent,
-        "the same walker, straight on": StraightOn(agent),
+        "walker, straight on": StraightOn(agent),
         "random walk": RandomWalk(agent.action_space, args.seed),
     }
     results = {name: evaluate_pairs(method, DEMO_ENV, n_pairs=args.pairs, seed=args.seed) for name, method in methods.items()}

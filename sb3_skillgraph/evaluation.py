@@ -263,8 +263,11 @@ def run_pair(agent: Predictor, env: gym.Env, start: np.ndarray | None, goal: np.
         nearest = min(nearest, _distance(observation))
         stuck = bool(info.get("stuck"))
         over = bool(info["is_success"]) or terminated or truncated or stuck
-    status, trace = (watch.plan.status, watch.trace) if watch is not None else (None, None)
-    return PairResult(start, goal, cells, bool(info["is_success"]), steps, status, trace, nearest, stuck)
+    success = bool(info["is_success"])
+    status, trace = None, None
+    if watch is not None:
+        status, trace = watch.plan.status, watch.ended(success and steps > 0)
+    return PairResult(start, goal, cells, success, steps, status, trace, nearest, stuck)
 
 
 def _distance(observation: Any) -> float:
@@ -287,3 +290,9 @@ class _Watch:
         self.trace.n_successes += sum(run.success for run in runs)
         self.trace.direct_steps += new_state.option[0] == DIRECT
         return action, tuple(new_state)
+
+    def ended(self, success: bool) -> SkillTrace:
+        """Count the run that has reached the goal, with which the episode ended."""
+        self.trace.n_runs += success
+        self.trace.n_successes += success
+        return self.trace

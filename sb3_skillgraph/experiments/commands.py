@@ -59,13 +59,13 @@ def add_figure(commands: Any) -> None:
     command = commands.add_parser(
         "figure",
         help="Redraw a figure of the paper from the runs of a plan.",
-        description="3 frontier and Fiedler values; 4 exploration; 5 learning curves; 6 growth of the graph; 7, 8 how sets "
-        "become edges; 9 where deep covering options fail.\n\n"
+        description="3 frontier and Fiedler values; 4 exploration; 5 learning curves; 6 growth of the graph; "
+        "9 where deep covering options fail.\n\n"
         "example:\n  sb3-skillgraph figure 5 benchmarks/compare.yml --out runs/compare --to figure_5.png",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     command.set_defaults(run=_figure)
-    command.add_argument("number", type=int, metavar="N", help="3 to 9")
+    command.add_argument("number", type=int, metavar="N", help="3, 4, 5, 6 or 9")
     _add_plan(command)
     command.add_argument("--environment", help="draw this one of the plan's environments (default: the first; 5 draws all)")
     command.add_argument("--method", help="draw this one of the plan's methods (default: the first that fits)")

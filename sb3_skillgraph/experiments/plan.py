@@ -25,7 +25,7 @@ class RunSpec:
     :param method: its name in the plan
     :param environment: its name in the plan
     :param seed: of everything random; pairs are drawn with ``seed + 1000``
-    :param algorithm: ``skill_graph``, ``uvfa``, ``her``, ``recipe``, ``covering_options`` or ``random_walk``
+    :param algorithm: ``skill_graph``, ``straight_on``, ``uvfa``, ``her``, ``recipe``, ``covering_options`` or ``random_walk``
     :param env_id: id of a ``SkillGraph/*`` environment
     :param steps: environment steps
     :param check_every: steps between tests, after each of which a checkpoint is taken

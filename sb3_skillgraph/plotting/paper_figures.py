@@ -1,4 +1,4 @@
-"""The paper's figures from arrays: growth, exploration, learning curves, and how sets become edges."""
+"""The paper's figures from arrays: growth, exploration, learning curves, and what is missed."""
 
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any, NamedTuple

@@ -10,6 +10,7 @@ from gymnasium import spaces
 
 from sb3_skillgraph.options.execution import Fate, fate
 from sb3_skillgraph.options.option import Option
+from sb3_skillgraph.options.walk import Walk
 
 MASK = "action_mask"
 MOST_AXES = 2  # up to so many dimensions of actions, primitive actions push along each axis
@@ -46,15 +47,14 @@ class OptionsEnv(gym.Wrapper):
 
     Observations gain an entry ``action_mask``, which :meth:`action_masks` returns as well: an option may run if it is
     mature, stands in its (optimistic) initiation set and not yet in its termination set. Options may be appended to the
-    list at any time; actions of those still unborn are masked. (``agent.options`` is a new list every time: a later one
-    needs a new ``OptionsEnv``, whose actions may be others.)
+    list at any time; actions of those still unborn are masked.
 
     Where the agent gets stuck (``info["stuck"]``) the episode is over, and costs are added up as if it stood there for
     ever. A ``Monitor`` belongs around this environment, not into it: from inside it does not see such an end.
 
     :param env: a goal environment (Dict observations, Box actions)
-    :param options: options, such as ``agent.options``, which knows the agent's global option; that one may be among them
-    :param global_option: walks straight to any goal; by default the one among ``options``, or that they know
+    :param options: options; the global option may be among them
+    :param global_option: walks straight to any goal; by default the one among ``options``
     :param primitives: actions scaled to [-1, 1], shape ``(n, action_dim)``; None takes both directions of every axis and
         standing still where actions have at most two dimensions, else one step of the global option's policy
     :param max_options: number of actions: room for options and primitive actions
@@ -83,12 +83,17 @@ class OptionsEnv(gym.Wrapper):
             raise ValueError(f"OptionsEnv needs a goal environment with Dict observations, not {inner}.")
         if not isinstance(env.action_space, spaces.Box):
             raise ValueError(f"OptionsEnv needs an environment with Box actions, not {env.action_space}.")
+        if any(isinstance(option, Walk) for option in options):
+            raise ValueError(
+                "OptionsEnv takes options with policies and initiation sets of their own, such as those of CoveringOptions; "
+                "walks, of which an agent's graph is made, cannot be its actions yet."
+            )
         self.options = options
         self.gamma = gamma
         self.timeout = timeout
         self.route = route
         listed = next((option for option in options if option.target is None), None)
-        self.global_option: Option | None = global_option or listed or getattr(options, "global_option", None)
+        self.global_option: Option | None = global_option or listed
         self._is_listed = listed is not None
         self.primitives = self._find_primitives(env.action_space, primitives)
         self.max_options = max_options
@@ -110,7 +115,7 @@ class OptionsEnv(gym.Wrapper):
         if not primitives and self.global_option is None:
             raise ValueError(
                 "There are neither primitive actions nor a global option, so that there could be places where nothing can "
-                "be done: give global_option=agent.global_option."
+                "be done: give a global_option."
             )
         return primitives
 
@@ -134,7 +139,7 @@ class OptionsEnv(gym.Wrapper):
         :raises ValueError: if there is none
         """
         if self.global_option is None:
-            raise ValueError("There is no global option: OptionsEnv(..., global_option=agent.global_option).")
+            raise ValueError("There is no global option: OptionsEnv(..., global_option=...).")
         return self.index(self.global_option.id) if self._is_listed else self.first_fixed
 
     def index(self, option: str) -> int:
