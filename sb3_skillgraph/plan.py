@@ -9,14 +9,17 @@ from sb3_skillgraph.edges import NOWHERE
 from sb3_skillgraph.planning import DIRECT, GOAL, Solution
 from sb3_skillgraph.runner import Runner, RunnerState
 
-Status = Literal["on_graph", "in_initiation", "off_graph"]
+Status = Literal["in_graph", "in_initiation_set", "outside"]
+
+#: Events that a sentence names; of more the first three and the last two.
+MOST_NAMED = 8
 
 
 class Plan(NamedTuple):
     """How the agent goes about a goal.
 
-    :param status: the paper's three cases: ``on_graph``, the goal lies where an option has been seen to end, in an event;
-        ``in_initiation``, near enough to an event to belong to it; ``off_graph``, where the agent has never been
+    :param status: the paper's three cases: ``in_graph``, the goal lies where an option has been seen to end, in an event;
+        ``in_initiation_set``, near enough to an event to belong to it; ``outside``, where the agent has never been
     :param path: ids of vertices: the option that runs first, where it leads, the option from there, ..., ``"goal"``
     :param expected_steps: environment steps to the goal, if it is reached
     :param success_probability: that it is reached within the horizon, failures and replanning included
@@ -28,12 +31,14 @@ class Plan(NamedTuple):
     success_probability: float
 
     def __str__(self) -> str:
-        walks = [vertex for vertex in self.path[1:-1:2]]
-        by_way = f" by way of {', '.join(walks)}" if walks else " straight on"
+        events = list(self.path[1:-1:2])
+        if len(events) > MOST_NAMED:
+            events[3:-2] = ["..."]
+        by_way = f" by way of {', '.join(events)}" if events else " straight on"
         known = {
-            "on_graph": "The goal lies in an event",
-            "in_initiation": "The goal lies beside an event",
-            "off_graph": "The goal lies where the agent has never been",
+            "in_graph": "The goal lies in an event",
+            "in_initiation_set": "The goal lies beside an event",
+            "outside": "The goal lies where the agent has never been",
         }[self.status]
         steps = f"about {self.expected_steps:.0f} steps" if np.isfinite(self.expected_steps) else "no telling when"
         return f"{known}: go there{by_way}, {steps}, success {self.success_probability:.0%}."
@@ -76,5 +81,5 @@ def _status(runner: Runner, goal: np.ndarray) -> Status:
     graph = runner.graph
     home = graph.locate(goal)
     if home == NOWHERE:
-        return "off_graph"
-    return "on_graph" if graph.events[home].holds(goal) else "in_initiation"
+        return "outside"
+    return "in_graph" if graph.events[home].holds(goal) else "in_initiation_set"

@@ -17,7 +17,7 @@ from sb3_skillgraph.evaluation import PairResult, PairsResult, SkillTrace, brier
 from sb3_skillgraph.planning import DIRECT, GOAL
 
 CORRIDOR: MazeMap = [[1] * 9, [1, "r", 0, 0, 0, 0, 0, 0, 1], [1] * 9]
-STATUSES = {"on_graph", "in_initiation", "off_graph"}
+STATUSES = {"in_graph", "in_initiation_set", "outside"}
 
 
 class RandomWalk:
@@ -131,7 +131,7 @@ def test_runs_are_counted_when_they_end(trained: SkillGraphAgent) -> None:
 def test_calibration_bins() -> None:
     plans = [(0.1, False), (0.19, True), (0.2, True), (0.99, True), (1.0, False)]
     zeros = np.zeros(2)
-    pairs = [PairResult(zeros, zeros, 3.0, success, 9, "on_graph", SkillTrace(p, 9.0)) for p, success in plans]
+    pairs = [PairResult(zeros, zeros, 3.0, success, 9, "in_graph", SkillTrace(p, 9.0)) for p, success in plans]
     result = PairsResult([*pairs, PairResult(zeros, zeros, 3.0, True, 9, None)])
     assert result.promises == plans
     bins = result.calibration()
@@ -263,14 +263,14 @@ def test_a_copy_is_an_agent_of_its_own(trained: SkillGraphAgent, make_copy: Any)
 
 def test_plan_of_an_agent_that_knows_nothing() -> None:
     plan = new_agent().plan(observation(-1.0, 1.0))
-    assert (plan.status, plan.path) == ("off_graph", (DIRECT, GOAL))
+    assert (plan.status, plan.path) == ("outside", (DIRECT, GOAL))
     assert 0.0 < plan.success_probability <= 1.0
 
 
 def test_plan_tells_the_three_cases(trained: SkillGraphAgent) -> None:
     start = trained.events[0].center
     for event in trained.events[::2]:
-        assert trained.plan(observation(*start), goal=event.center).status == "on_graph"
+        assert trained.plan(observation(*start), goal=event.center).status == "in_graph"
     grid = np.stack(np.meshgrid(np.linspace(-2.2, 2.2, 9), np.linspace(-2.2, 2.2, 9)), axis=-1).reshape(-1, 2)
     nearest = [min(float(np.linalg.norm(event.center - point)) for event in trained.events) for point in grid]
     seen = set()
@@ -279,9 +279,9 @@ def test_plan_tells_the_three_cases(trained: SkillGraphAgent) -> None:
         seen.add(status)
         if abs(distance - trained.event_radius) > 1e-6 and abs(distance - trained.graph.cover_radius) > 1e-6:
             inside, near = distance < trained.event_radius, distance < trained.graph.cover_radius
-            assert status == ("on_graph" if inside else "in_initiation" if near else "off_graph")
+            assert status == ("in_graph" if inside else "in_initiation_set" if near else "outside")
     assert seen == STATUSES
-    assert trained.plan(observation(*start), goal=np.array([50.0, 50.0])).status == "off_graph"
+    assert trained.plan(observation(*start), goal=np.array([50.0, 50.0])).status == "outside"
 
 
 def test_plan_is_a_path_of_the_graph(trained: SkillGraphAgent) -> None:

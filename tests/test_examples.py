@@ -66,7 +66,7 @@ def test_ant_to_any_goal(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys
     run(monkeypatch, "ant_to_any_goal.py", tmp_path / "agent.zip", *goals, *more)
     out = capsys.readouterr().out
     assert "goal [-3.9, 4.1]: " in out and "steps, reached" in out
-    assert "goal [-4.0, -4.0]: off_graph, " in out
+    assert "goal [-4.0, -4.0]: outside, " in out
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"way_0.png", "way_1.png", "ant.gif", "ant.png"}
     assert Darkness.n_frames > 10
     with pytest.raises(SystemExit):

@@ -90,7 +90,7 @@ def check_plan(agent: SkillGraphAgent, moment: Moment, where: str) -> None:
         assert graph.index(event) >= 0, where
     assert 0.0 < moment.plan.success_probability <= 1.0, where
     assert 0.0 <= moment.plan.expected_steps < np.inf, where
-    assert moment.plan.status in ("on_graph", "in_initiation", "off_graph")
+    assert moment.plan.status in ("in_graph", "in_initiation_set", "outside")
 
 
 def check_episodes(agent: SkillGraphAgent, env_id: str, seeds: range, max_steps: int) -> int:

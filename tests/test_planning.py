@@ -873,7 +873,7 @@ def known_line() -> SkillGraph:
 
 
 @pytest.mark.parametrize(
-    ("goal", "status"), [((12.5, 0.0), "on_graph"), ((12.0, 1.3), "in_initiation"), ((12.0, 5.0), "off_graph")]
+    ("goal", "status"), [((12.5, 0.0), "in_graph"), ((12.0, 1.3), "in_initiation_set"), ((12.0, 5.0), "outside")]
 )
 def test_a_plan_tells_which_of_the_papers_three_cases_holds(goal: tuple[float, float], status: str) -> None:
     assert plan_from(straight_runner(known_line()), (0.0, 0.0), goal).status == status
@@ -891,10 +891,10 @@ def test_a_plan_reads_as_a_sentence() -> None:
     plan = plan_from(runner, (0.0, 0.0), (12.0, 0.0))
     expected = f"about {plan.expected_steps:.0f} steps, success {plan.success_probability:.0%}."
     assert str(plan) == f"The goal lies in an event: go there by way of e1, e2, {expected}"
-    assert str(plan._replace(path=("direct", "goal"), status="off_graph")).startswith(
+    assert str(plan._replace(path=("direct", "goal"), status="outside")).startswith(
         "The goal lies where the agent has never been: go there straight on, "
     )
-    beside = plan._replace(status="in_initiation", expected_steps=np.inf)
+    beside = plan._replace(status="in_initiation_set", expected_steps=np.inf)
     assert str(beside).startswith("The goal lies beside an event: go there by way of e1, e2, no telling when")
 
 
