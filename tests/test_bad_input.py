@@ -38,6 +38,11 @@ from sb3_skillgraph.events import Event
 from sb3_skillgraph.saving import SCHEMA
 
 
+def shown(arguments: dict[str, Any]) -> str:
+    """Name a case; the same in every process, so that workers agree on what there is to test."""
+    return ", ".join(f"{name}={'a function' if callable(value) else value}" for name, value in arguments.items())
+
+
 class Spaces(gym.Env):
     """An environment that has spaces and nothing else."""
 
@@ -126,7 +131,7 @@ OUT_OF_RANGE: list[dict[str, Any]] = [
 ]
 
 
-@pytest.mark.parametrize("arguments", OUT_OF_RANGE, ids=lambda arguments: str(*arguments.items()))
+@pytest.mark.parametrize("arguments", OUT_OF_RANGE, ids=shown)
 def test_refused_arguments(arguments: dict[str, Any]) -> None:
     name = next(iter(arguments))
     with pytest.raises(ValueError, match=name.replace("_", ".")):
@@ -144,7 +149,7 @@ def test_refused_arguments(arguments: dict[str, Any]) -> None:
         dict(shaping=float("inf")),
         dict(explore_beyond=float("inf")),
     ],
-    ids=lambda arguments: str(*arguments.items()),
+    ids=shown,
 )
 def test_refused_arguments_that_are_no_such_numbers(arguments: dict[str, Any]) -> None:
     name = next(iter(arguments))
