@@ -372,7 +372,11 @@ class SkillGraphAgent(OffPolicyAlgorithm):
         return (actions if vectorized else actions[0]), running, runs
 
     def _running_state(self, n_envs: int, state: tuple[np.ndarray, ...] | None) -> RunnerState:
-        return RunnerState.fresh(n_envs, self._spec.goal_dim) if state is None else RunnerState(*state)
+        if state is None:
+            return RunnerState.fresh(n_envs, self._spec.goal_dim)
+        if len(state) != len(RunnerState._fields) or len(state[0]) != n_envs:
+            raise ValueError(f"The state is not one that predict has returned for {n_envs} environments.")
+        return RunnerState(*state)
 
     def running(self, state: tuple[np.ndarray, ...]) -> list[str]:
         """
@@ -393,9 +397,11 @@ class SkillGraphAgent(OffPolicyAlgorithm):
         :param goal: the goal, shape ``(goal_dim,)``; by default ``obs["desired_goal"]``
         :param state: what the last :meth:`predict` returned; None at the start of an episode
         :return: which of the paper's three cases holds, the path, and what it promises
-        :raises ValueError: if the goal is not a finite vector of goal space
+        :raises ValueError: if the goal is not a finite vector of goal space, or there are several environments
         """
         batch, _ = as_batch(obs, self.observation_space)
+        if len(batch["achieved_goal"]) != 1:
+            raise ValueError(f"A plan is for one environment, not for {len(batch['achieved_goal'])}.")
         target = batch["desired_goal"][0] if goal is None else as_goal(goal, self._spec.goal_dim)
         running = self._running_state(1, state)
         running, _ = self.parts.runner.advance(running, batch["achieved_goal"])

@@ -213,6 +213,8 @@ def evaluate_pairs(
     :return: success rate, interval and every pair
     :raises NoPairsError: if the environment has no maze geometry to draw pairs from, or one that is too small
     """
+    if n_pairs < 1:
+        raise ValueError(f"n_pairs must be 1 at least, not {n_pairs!r}.")
     made = gym.make(env, **(env_kwargs or {})) if isinstance(env, str) else env
     try:
         if not made.has_wrapper_attr("geometry"):

@@ -77,7 +77,7 @@ def as_batch(observation: Any, space: spaces.Space) -> tuple[dict[str, np.ndarra
     :param observation: Dict observation with or without a leading axis
     :param space: the environment's observation space
     :return: rows by entry, each of shape ``(n, dim)``, and whether there was a leading axis
-    :raises ValueError: if the observation does not fit the space
+    :raises ValueError: if the observation does not fit the space, or is not finite
     """
     if not isinstance(observation, dict) or any(key not in observation for key in KEYS):
         raise ValueError(f"A Dict observation with {', '.join(KEYS)} is needed, not {type(observation).__name__}.")
@@ -89,6 +89,8 @@ def as_batch(observation: Any, space: spaces.Space) -> tuple[dict[str, np.ndarra
         shape = space[key].shape
         if array.shape[int(vectorized) :] != shape:
             raise ValueError(f"{key!r} has shape {array.shape}; expected {shape}, or the same with a leading axis.")
+        if not np.isfinite(array).all():
+            raise ValueError(f"{key!r} holds NaN or inf: {array}.")
         batch[key] = array.reshape(len(array) if vectorized else 1, -1)
     return batch, vectorized
 
