@@ -52,8 +52,9 @@ class SkillGraphAgent(OffPolicyAlgorithm):
     :param batch_size: transitions in a minibatch
     :param tau: soft update coefficient of the target networks
     :param gamma: discount factor
-    :param train_freq: environment steps between updates
-    :param gradient_steps: minibatch updates per ``train_freq`` steps
+    :param train_freq: steps of every environment between updates
+    :param gradient_steps: minibatch updates per ``train_freq`` steps, for each environment (with SB3's algorithms, for all
+        together): so that several environments learn as much as one in as many steps
     :param action_noise: SB3 action noise, or the standard deviation of Gaussian noise, in units of the scaled action;
         None for none
     :param stats_window_size: episodes over which SB3's rollout statistics are averaged
@@ -302,6 +303,8 @@ class SkillGraphAgent(OffPolicyAlgorithm):
         """
         if len(self.parts.store) < batch_size:
             return  # loaded without its replay buffer: first gather some experience
+        if self.gradient_steps > 0:
+            gradient_steps *= self.n_envs  # as many for a step, however many environments take it at once
         learner = self.parts.walker.learner
         learner._current_progress_remaining = self._current_progress_remaining
         learner.train(gradient_steps, batch_size)
