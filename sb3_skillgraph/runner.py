@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_skillgraph.choices import PESSIMISTIC, Runs, Start
+from sb3_skillgraph.choices import EXPECTED, OPTIMISTIC, PESSIMISTIC, Runs, Start
 from sb3_skillgraph.edges import NOWHERE
 from sb3_skillgraph.graph import SkillGraph
 from sb3_skillgraph.options.numpy_actor import NumpyActor
@@ -208,8 +208,13 @@ class Runner:
         return Start(point.astype(np.float64), graph.locate(point) if event == NOWHERE else event)
 
     def decide(self, state: RunnerState, i: int, start: Start, goal: np.ndarray, stance: float) -> Solution:
-        """Plan for one environment."""
-        return self.planner.solve(start, goal.astype(np.float64), self.runs(state, i), stance)
+        """Plan for one environment; where everything seems lost, count on more: then a gamble is better than nothing."""
+        runs = self.runs(state, i)
+        for counted_on in (stance, EXPECTED, OPTIMISTIC):
+            solution = self.planner.solve(start, goal.astype(np.float64), runs, counted_on)
+            if counted_on >= OPTIMISTIC or solution.values[solution.start] < self.planner.lost:
+                break
+        return solution
 
     def begin(self, state: RunnerState, i: int, solution: Solution, start: Start, goal: np.ndarray) -> None:
         """Begin the first option of a plan, in place."""
