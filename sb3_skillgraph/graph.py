@@ -11,7 +11,7 @@ from sb3_skillgraph.events import Event
 #: Landmarks lie at least so many event radii apart: 1.5 to 3 make the same agent, fewer make plans cheaper.
 SPACING = 1.5
 #: Edges out of an event, at most (a few more until they are next looked through); a plan looks at all of them.
-MAX_DEGREE = 24
+MAX_DEGREE = 32
 #: Half of its training ago the walker was another one: what ran then counts half as much, to this power.
 AGING = 1.0
 #: Updates of the walker before which runs do not age: all of its training so far would be "half of it ago".
