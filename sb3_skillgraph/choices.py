@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_skillgraph.edges import NOWHERE
+from sb3_skillgraph.edges import NOWHERE, land
 from sb3_skillgraph.graph import SkillGraph
 from sb3_skillgraph.walk_model import Kind, WalkModel
 
@@ -124,12 +124,7 @@ class Choices(NamedTuple):
             self.successes[row] += weight
             return
         self.failures[row] += weight
-        landings, weights = self.landing[row], self.weight[row]
-        known = np.flatnonzero((landings == landing) & (weights > 0.0))
-        slot = int(known[0]) if len(known) else int(weights.argmin())
-        if not len(known):
-            landings[slot], weights[slot] = landing, 0.0
-        weights[slot] += weight
+        land(self.landing[row], self.weight[row], landing, weight)
 
 
 class ChoiceModel:

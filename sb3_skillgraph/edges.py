@@ -131,3 +131,18 @@ class Edges:
         if self.size == 0:
             self._arrays = Edges()._arrays
         self.keep(np.arange(self.size))
+
+
+def land(landings: np.ndarray, weights: np.ndarray, landing: int, weight: float) -> None:
+    """Add to the weight of a landing, in place; a new one takes the place of the lightest.
+
+    :param landings: events in which runs landed, shape ``(MAX_LANDINGS,)``
+    :param weights: their weights, same shape
+    :param landing: the event, ``NOWHERE`` for none
+    :param weight: to add
+    """
+    known = np.flatnonzero((landings == landing) & (weights > 0.0))
+    slot = int(known[0]) if len(known) else int(weights.argmin())
+    if not len(known):
+        landings[slot], weights[slot] = landing, 0.0
+    weights[slot] += weight

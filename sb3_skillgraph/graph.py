@@ -5,7 +5,7 @@ from typing import Any
 import networkx
 import numpy as np
 
-from sb3_skillgraph.edges import NOWHERE, Edges
+from sb3_skillgraph.edges import NOWHERE, Edges, land
 from sb3_skillgraph.events import Event
 
 #: Landmarks lie at least so many event radii apart: 1.5 to 3 make the same agent, fewer make plans cheaper.
@@ -95,7 +95,7 @@ class SkillGraph:
         return np.linalg.norm(self.centers - point, axis=1)
 
     def add_event(self, center: np.ndarray, *, salient: bool) -> int:
-        """Add an event; where there is no room for another one the cover grows coarser first.
+        """Add an event; whoever adds sees to it that there is room (see :meth:`coarsen`).
 
         :param center: shape ``(goal_dim,)``
         :param salient: whether it is a target of its own, or a landmark
@@ -223,12 +223,7 @@ class SkillGraph:
         return self._aging(self.edges.updated)
 
     def _land(self, row: int, landing: int, weight: float) -> None:
-        landings, weights = self.edges.landing[row], self.edges.landing_weight[row]
-        known = np.flatnonzero((landings == landing) & (weights > 0.0))
-        slot = int(known[0]) if len(known) else int(weights.argmin())
-        if not len(known):
-            landings[slot], weights[slot] = landing, 0.0
-        weights[slot] += weight
+        land(self.edges.landing[row], self.edges.landing_weight[row], landing, weight)
 
     def bound_degree(self, worth: np.ndarray) -> None:
         """Let go of the edges of each event that are worth least, where it has too many.

@@ -53,19 +53,13 @@ def describe(runner: Runner, state: RunnerState, point: np.ndarray, goal: np.nda
     :param goal: shape ``(goal_dim,)``
     :return: the plan; its first option is the one that runs, or would be begun
     """
-    solution = runner.decide(state, 0, runner.start(state, 0, point), goal, PESSIMISTIC)
-    first = _running(runner, state, solution) if state.option[0] else solution.first()
+    start = runner.start(state, 0, point)
+    solution = runner.decide(state, 0, start, goal, PESSIMISTIC)
+    first = solution.first() if start.towards == NOWHERE else solution.leading_to(start.towards)
     # A running option has taken some of its steps already.
     remaining = max(runner.planner.horizon - float(state.elapsed[0] - state.steps[0]), 1.0)
     probability, steps = runner.planner.promise(solution, first, remaining)
     return Plan(_status(runner, goal), _ids(runner, solution, runner.planner.path(solution, first)), steps, probability)
-
-
-def _running(runner: Runner, state: RunnerState, solution: Solution) -> int:
-    """Return the choice at the start that stands for the running option."""
-    option, episode = str(state.option[0]), solution.episode
-    target = solution.goal if option == DIRECT else runner.graph.index(option)
-    return int(np.flatnonzero((episode.source == solution.start) & (episode.target == target))[0])
 
 
 def _ids(runner: Runner, solution: Solution, path: list[tuple[int, int]]) -> tuple[str, ...]:

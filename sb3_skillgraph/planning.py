@@ -129,6 +129,10 @@ class Solution(NamedTuple):
         direct = cheapest[self.episode.target[cheapest] == self.goal]
         return int(direct[0] if len(direct) else cheapest[0])
 
+    def leading_to(self, target: int) -> int:
+        """Return the row, among those of the episode, of the choice at the start that leads to a vertex."""
+        return int(np.flatnonzero((self.episode.source == self.start) & (self.episode.target == target))[0])
+
     def best(self, first: int) -> np.ndarray:
         """Return the row of the choice at each vertex, shape of ``values``: the cheapest, the first of equals.
 

@@ -20,8 +20,6 @@ N_PROPOSALS = 3
 TOWARDS = 0.5
 #: Share of the missions that look for a way to a goal which adaptation is for, while nobody has been there.
 LOOK_FOR_A_WAY = 0.5
-
-
 #: Share of the missions without noise: noise makes its own luck, and only runs without it go into records.
 CLEAN = 0.5
 

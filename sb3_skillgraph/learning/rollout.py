@@ -21,7 +21,6 @@ class Step(NamedTuple):
 
     observation: dict[str, np.ndarray]
     action: np.ndarray
-    aims: np.ndarray
     state: RunnerState
     held: np.ndarray
     hold_left: np.ndarray
@@ -106,7 +105,7 @@ class Rollout:
         goals = np.stack([mission.goal for mission in missions])
         scaled, state = self.runner.act(observation, goals, state, OPTIMISTIC)
         scaled, held, hold_left = self.with_noise(scaled, missions, noise)
-        self.pending = Step(observation, scaled, state.aim, state, held, hold_left, rng_state)
+        self.pending = Step(observation, scaled, state, held, hold_left, rng_state)
         return scaled
 
     def _explorers(self, state: RunnerState, missions: list[Mission]) -> RunnerState:
@@ -169,7 +168,7 @@ class Rollout:
             reached["observation"],
             points,
             step.action,
-            step.aims,
+            step.state.aim,
             terminated,
             dones,
             stuck,

@@ -1,4 +1,4 @@
-"""What trajectories and runs teach the graph (DESIGN: evidence): where one has been, what was crossed, how runs ended."""
+"""What trajectories and runs teach the graph: where one has been, what was crossed, how runs ended."""
 
 from typing import Any
 
