@@ -240,18 +240,24 @@ class ChoiceModel:
         """Return the walks to the goal itself, from events.
 
         Where the goal belongs to an event, whoever can walk to that can walk to the goal as well. From there itself, and from
-        the events nearest to the goal if they have no such walk, it is a guess.
+        the events nearest to the goal if they have no such walk, it is a guess; a walk that would be longer than any in the
+        graph is considered only where there is no shorter one.
         """
         graph, vertex = self.graph, len(self.graph.events)
         distance = graph.distances(goal)
         home = graph.locate(goal)
         near = np.argsort(distance, kind="stable")[:NEAR_EVENTS]
         if home == NOWHERE:
-            return self._guessed(near, near, vertex, distance[near], np.zeros(len(near)), runs)
+            return self._short(self._guessed(near, near, vertex, distance[near], np.zeros(len(near)), runs))
         beside = self._beside(self._edges(graph.edges.target == home, replaced, tried), home, distance, runs)
         near = near[~np.isin(near, beside.source)]
         seen = (near == home).astype(np.float64)  # somebody was near the goal, in its event
-        return Choices.join([self._guessed(near, near, vertex, distance[near], seen, runs), beside])
+        return self._short(Choices.join([self._guessed(near, near, vertex, distance[near], seen, runs), beside]))
+
+    def _short(self, choices: Choices) -> Choices:
+        """Return those that are no longer than the walks of the graph; the shortest where there is none."""
+        shortest = float(choices.steps.min(initial=np.inf))
+        return choices.take(np.flatnonzero(choices.steps <= max(shortest, self.graph.walk_steps)))
 
     def _beside(self, walks: Choices, home: int, distance: np.ndarray, runs: Runs) -> Choices:
         """Return walks to the goal for the walks to its event.
@@ -316,7 +322,7 @@ class ChoiceModel:
     def _at_start(
         self, replaced: np.ndarray, tried: Choices, to_goal: Choices, start: Start, goal: np.ndarray, runs: Runs
     ) -> Choices:
-        """Return what can be done at the start: what can be done in its event, and walks that always can be tried."""
+        """Return what can be done at the start: what can be done in its event, and walks that can be tried."""
         graph, n_events = self.graph, len(self.graph.events)
         here, distances = np.array([n_events + 1]), graph.distances(start.point)
         event = np.array([start.event])
@@ -334,7 +340,10 @@ class ChoiceModel:
         targets = np.concatenate([part.target for part in parts])
         if n_events not in targets:
             distance = np.array([np.linalg.norm(goal - start.point)])
-            parts.append(self._guessed(here, event, n_events, distance, np.zeros(1), runs))
+            direct = self._guessed(here, event, n_events, distance, np.zeros(1), runs)
+            # One that would be longer than any walk in the graph is begun only where there is nothing else to do.
+            if direct.steps[0] <= graph.walk_steps or not len(targets) or start.towards == n_events:
+                parts.append(direct)
         if start.towards not in (NOWHERE, n_events) and start.towards not in targets:
             parts.append(self._guessed(here, event, start.towards, distances[[start.towards]], np.ones(1), runs))
         choices = Choices.join(parts)

@@ -31,12 +31,14 @@ class SkillGraph:
     :param goal_dim: dimension of goal space
     :param radius: radius of the events, in goal units
     :param max_events: how many there may be; when there are more the cover grows coarser
+    :param walk_steps: environment steps within which a trajectory that goes from one event to another makes an edge
     """
 
-    def __init__(self, goal_dim: int, radius: float, max_events: int) -> None:
+    def __init__(self, goal_dim: int, radius: float, max_events: int, walk_steps: int = 40) -> None:
         self.goal_dim = goal_dim
         self.radius = radius
         self.max_events = max_events
+        self.walk_steps = walk_steps
         self.cover_radius = SPACING * radius
         self.events: list[Event] = []
         self.edges = Edges()

@@ -81,7 +81,8 @@ class Parts:
             arguments["shaping"],
         )
         walker = factory.make("walker", None, None)
-        graph, model = SkillGraph(spec.goal_dim, radius, arguments["max_events"]), WalkModel()
+        graph = SkillGraph(spec.goal_dim, radius, arguments["max_events"], arguments["walk_steps"])
+        model = WalkModel()
         planner = Planner(graph, model, _horizon(agent.env))
         runner = Runner(graph, planner, walker.actor, view)
         salience = _salience(arguments, graph, store, agent)
@@ -92,7 +93,7 @@ class Parts:
             arguments["explore_beyond"],
             rng,
         )
-        witness = Witness(graph, planner.choice_model, arguments["walk_steps"], agent.n_envs)
+        witness = Witness(graph, planner.choice_model, agent.n_envs)
         noise = arguments["action_noise"]
         rollout = Rollout(
             runner,
@@ -223,7 +224,7 @@ def _salience(arguments: dict[str, Any], graph: SkillGraph, store: TransitionSto
     if salience == "frontier":
         return FrontierSalience(graph)
     if salience == "dco":
-        return DCOSalience(store, graph, arguments["walk_steps"])
+        return DCOSalience(store, graph, graph.walk_steps)
     if salience == "rrt":
         return RandomSalience(Oracle(agent.get_env))
     if not hasattr(salience, "propose"):

@@ -146,7 +146,7 @@ def check_graph(agent: SkillGraphAgent) -> None:
     assert edges.size > 0
     assert (edges.forward + edges.backward > 0).all()
     assert (edges.source != edges.target).all()
-    assert (edges.crossing_steps[edges.forward > 0] <= agent.parts.witness.walk_steps).all()
+    assert (edges.crossing_steps[edges.forward > 0] <= agent.graph.walk_steps).all()
     assert (edges.crossing_steps >= 1).all()
     for column in (edges.successes, edges.failures, edges.success_steps, edges.landing_weight):
         assert (np.isfinite(column) & (column >= 0)).all()

@@ -118,7 +118,7 @@ def test_excluded_arguments_take_their_defaults(tmp_path: Path) -> None:
     agent = new_agent(walk_steps=33, gamma=0.5)
     agent.save(tmp_path / "without", exclude=["walk_steps", "gamma"], include=["gamma"])
     loaded = SkillGraphAgent.load(tmp_path / "without")
-    assert (loaded.parts.witness.walk_steps, loaded.gamma) == (40, 0.5)
+    assert (loaded.graph.walk_steps, loaded.gamma) == (40, 0.5)
 
 
 @pytest.mark.parametrize("how", ["custom_objects", "kwargs"])
@@ -126,7 +126,7 @@ def test_arguments_given_at_loading_win(trained_files: tuple[Path, Path], how: s
     changes = dict(learning_rate=7e-5, walk_steps=44)
     arguments: dict[str, Any] = {"custom_objects": changes} if how == "custom_objects" else changes
     agent = SkillGraphAgent.load(trained_files[0], **arguments)
-    assert agent.parts.witness.walk_steps == 44
+    assert agent.graph.walk_steps == 44
     assert agent.learning_rate == 7e-5
     assert agent.parts.walker.learner.actor_learning_rate == 7e-5
 

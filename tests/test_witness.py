@@ -18,8 +18,8 @@ every_time = settings(derandomize=True, deadline=None, max_examples=30, database
 
 def make_witness(n_envs: int = 1, *, walk_steps: int = 40, max_events: int = 100) -> Witness:
     """A witness of trajectories in the plane, where events have radius 1 and belong to those within 1.5."""
-    graph = SkillGraph(2, 1.0, max_events)
-    return Witness(graph, ChoiceModel(graph, WalkModel()), walk_steps, n_envs)
+    graph = SkillGraph(2, 1.0, max_events, walk_steps)
+    return Witness(graph, ChoiceModel(graph, WalkModel()), n_envs)
 
 
 def walk(witness: Witness, xs: list[float], env: int = 0, y: float = 0.0) -> list[bool]:

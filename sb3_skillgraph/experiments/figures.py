@@ -102,7 +102,7 @@ def frontier(specs: Sequence[RunSpec], out: Path) -> Axes:
     for axes, share in zip(panels, SHARES, strict=True):
         n_steps = int(share * len(visits))
         store.total = store.oldest + n_steps  # what the agent knew then
-        embedding = learn_fiedler(store, agent._arguments["walk_steps"], N_PAIRS, np.random.default_rng(0))
+        embedding = learn_fiedler(store, agent.graph.walk_steps, N_PAIRS, np.random.default_rng(0))
         points = draw.thinned(visits[:n_steps])
         values = embedding(points)
         ends = points[[values.argmin(), values.argmax()]]

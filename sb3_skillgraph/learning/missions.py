@@ -6,8 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from sb3_skillgraph.edges import NOWHERE
 from sb3_skillgraph.graph import SkillGraph
-from sb3_skillgraph.learning.salience import Salience
+from sb3_skillgraph.learning.salience import FrontierSalience, Salience
 from sb3_skillgraph.runner import Run
 
 #: Failed runs after which a mission is given up.
@@ -18,8 +19,9 @@ EXPLORE = 0.9
 N_PROPOSALS = 3
 #: Share of the explorations that go on towards the proposed point; the others walk at random.
 TOWARDS = 0.5
-#: Share of the missions that look for a way to a goal which adaptation is for, while nobody has been there.
-LOOK_FOR_A_WAY = 0.5
+#: Share of the missions that look for a way to a goal which adaptation is for, while nobody has been there; of those the
+#: share that sets out from the event nearest to it: what lies nearest may be the far side of a wall.
+LOOK_FOR_A_WAY, FROM_NEAREST = 0.5, 0.5
 #: Share of the missions without noise: noise makes its own luck, and only runs without it go into records.
 CLEAN = 0.5
 
@@ -134,20 +136,24 @@ class Missions:
 
     def _choose(self, point: np.ndarray) -> Mission:
         if self.pinned is not None:
-            return self._adapt(self.pinned)
+            return self._adapt(point, self.pinned)
         if self.rng.random() < EXPLORE:
-            return self._explore(point)
+            return self._explore(point, self.salience)
+        return self._travel()
+
+    def _travel(self) -> Mission:
+        """Go to any event."""
         return Mission(self.graph.centers[self.rng.integers(len(self.graph.events))].copy())
 
     def _random_walk(self, point: np.ndarray) -> Mission:
         return Mission(point.astype(np.float64), explore_steps=self.exploration_steps, exploring=True)
 
-    def _explore(self, point: np.ndarray) -> Mission:
+    def _explore(self, point: np.ndarray, salience: Salience) -> Mission:
         """Go to the event nearest to a proposed point, and on towards it or at random.
 
         Of some proposals it is the one whose event has been visited least.
         """
-        proposals = [self.salience.propose(self.rng) for _ in range(N_PROPOSALS)]
+        proposals = [salience.propose(self.rng) for _ in range(N_PROPOSALS)]
         points = [proposal for proposal in proposals if proposal is not None]
         if not points:
             return self._random_walk(point)
@@ -163,12 +169,14 @@ class Missions:
         further = self.explore_beyond * self.graph.radius / max(float(np.linalg.norm(way)), 1e-9)
         return Mission(goal, self.exploration_steps, point + further * way)
 
-    def _adapt(self, goal: np.ndarray) -> Mission:
+    def _adapt(self, point: np.ndarray, goal: np.ndarray) -> Mission:
         """Pursue the goal that adaptation is for; look for a way to it while nobody has been there (section 3.3)."""
-        nearest = int(self.graph.distances(goal).argmin())
-        unseen = np.linalg.norm(self.graph.centers[nearest] - goal) > self.graph.cover_radius
-        if unseen and self.rng.random() < LOOK_FOR_A_WAY:
-            return self._beyond(nearest, goal)
+        if math.dist(point.tolist(), goal.tolist()) <= self.graph.radius:
+            return self._travel()  # to come back from somewhere else
+        if self.graph.locate(goal) == NOWHERE and self.rng.random() < LOOK_FOR_A_WAY:
+            if self.rng.random() < FROM_NEAREST:
+                return self._beyond(int(self.graph.distances(goal).argmin()), goal)
+            return self._explore(point, FrontierSalience(self.graph, goal))
         return Mission(goal.copy())
 
     # -- saving -------------------------------------------------------------------------------------------------------

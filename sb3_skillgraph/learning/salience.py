@@ -43,10 +43,12 @@ class FrontierSalience:
     (the Voronoi bias of an RRT, section 2.4).
 
     :param graph: the skill graph, whose events lie all over what has been visited
+    :param goal: a place that the box is to hold as well, shape ``(goal_dim,)``; None for none
     """
 
-    def __init__(self, graph: SkillGraph) -> None:
+    def __init__(self, graph: SkillGraph, goal: np.ndarray | None = None) -> None:
         self.graph = graph
+        self.goal = goal
 
     def propose(self, rng: np.random.Generator) -> np.ndarray | None:
         """Propose a point in or near the box; None before anything was visited."""
@@ -57,5 +59,7 @@ class FrontierSalience:
 
     def box(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the corners of the box, each of shape ``(goal_dim,)``."""
-        centers, margin = self.graph.centers, MARGIN * self.graph.radius
-        return centers.min(axis=0) - margin, centers.max(axis=0) + margin
+        inside, margin = self.graph.centers, MARGIN * self.graph.radius
+        if self.goal is not None:
+            inside = np.concatenate([inside, self.goal[None]])
+        return inside.min(axis=0) - margin, inside.max(axis=0) + margin

@@ -39,14 +39,12 @@ class Witness:
 
     :param graph: the skill graph
     :param choice_model: what is expected of options so far, and the model of untried walks
-    :param walk_steps: environment steps within which a crossing from one event to another makes an edge
     :param n_envs: number of environments
     """
 
-    def __init__(self, graph: SkillGraph, choice_model: ChoiceModel, walk_steps: int, n_envs: int) -> None:
+    def __init__(self, graph: SkillGraph, choice_model: ChoiceModel, n_envs: int) -> None:
         self.graph = graph
         self.choice_model = choice_model
-        self.walk_steps = walk_steps
         self._samples = np.zeros((N_SAMPLES, _COLUMNS))
         self._n_samples = 0
         self._n_steps = 0  # of all environments, since the last fit
@@ -110,7 +108,7 @@ class Witness:
     def _left(self, env: int) -> None:
         """A stay is over: every event that was passed shortly before has been crossed from."""
         *earlier, last = self._stays[env]
-        recent = [stay for stay in earlier if last.step - stay.step <= self.walk_steps]
+        recent = [stay for stay in earlier if last.step - stay.step <= self.graph.walk_steps]
         seen = set()
         for stay in reversed(recent):
             if stay.event != last.event and stay.event not in seen:
