@@ -58,3 +58,19 @@ def distance(a: Any, b: Any) -> float:
     """Return the largest difference between two learners' parameters."""
     pairs = zip(a.policy.parameters(), b.policy.parameters(), strict=True)
     return max((p.cpu() - q.cpu()).abs().max().item() for p, q in pairs)
+
+
+def by_torch(model: Any) -> Any:
+    """Have a model of ours take the reference update, and return it."""
+    model._compiled_update = lambda: None
+    return model
+
+
+def same(a: Any, b: Any) -> bool:
+    """Tell whether two learners' parameters and moments are the same to the bit."""
+    return distance(a, b) == 0 and all(
+        th.equal(s[key], t[key])
+        for x, y in ((a.actor, b.actor), (a.critic, b.critic))
+        for s, t in zip(x.optimizer.state.values(), y.optimizer.state.values(), strict=True)
+        for key in ("step", "exp_avg", "exp_avg_sq")
+    )

@@ -1,21 +1,21 @@
 import copy
 import pickle
+import subprocess
+import sys
 import warnings
 
 import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
-from learners import ACTOR_LR, CRITIC_LR, distance, fill, make, train
+from learners import ACTOR_LR, CRITIC_LR, by_torch, distance, fill, make, same, train
 from stable_baselines3 import DDPG, SAC, TD3
 from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.logger import Logger
 
 from sb3_skillgraph.options import learner as learner_module
-from sb3_skillgraph.options.fast_update import FastUpdate, StepSettings
 from sb3_skillgraph.options.learner import OptionDDPG, OptionTD3
-from sb3_skillgraph.options.numpy_actor import NumpyActor
-from sb3_skillgraph.options.plain_networks import is_vector_space
+from sb3_skillgraph.options.numpy_actor import NumpyActor, is_vector_space
 
 
 @pytest.fixture(autouse=True)
@@ -43,15 +43,6 @@ def stock_twin(model, cls):
     return twin
 
 
-def same(a, b):
-    return distance(a, b) == 0 and all(
-        th.equal(s[key], t[key])
-        for x, y in ((a.actor, b.actor), (a.critic, b.critic))
-        for s, t in zip(x.optimizer.state.values(), y.optimizer.state.values(), strict=True)
-        for key in ("step", "exp_avg", "exp_avg_sq")
-    )
-
-
 @pytest.mark.parametrize(
     "ours, stock, net_arch",
     [
@@ -63,15 +54,21 @@ def same(a, b):
         (OptionTD3, TD3, {"pi": [16], "qf": [32, 24, 16]}),
     ],
 )
-def test_two_hundred_updates_are_sb3s(ours, stock, net_arch):
+@pytest.mark.parametrize("path", ["kernel", "reference"])
+def test_two_hundred_updates_are_sb3s(ours, stock, net_arch, path):
     a = make(ours, net_arch)
     b = stock_twin(a, stock)
+    if path == "reference":
+        by_torch(a)
     for seed in range(20):
         for model in (a, b):
             train(model, 10, seed=seed)
-    assert isinstance(a._fast_update, FastUpdate)
+    assert a.update_path == path
     assert a._n_updates == b._n_updates == 200
-    assert distance(a, b) <= 1e-5
+    if path == "reference":
+        assert same(a, b)
+    else:
+        assert distance(a, b) <= 1e-5
     assert a.logger.name_to_value.keys() == b.logger.name_to_value.keys()
     for name, value in b.logger.name_to_value.items():
         assert a.logger.name_to_value[name] == pytest.approx(value, rel=1e-4, abs=1e-5), name
@@ -94,12 +91,11 @@ def test_large_networks_are_sb3s(ours, stock):
 @pytest.mark.parametrize("ours, stock", [(OptionDDPG, DDPG), (OptionTD3, TD3)])
 def test_random_generators_end_where_sb3_leaves_them(ours, stock):
     a = make(ours, [8])
-    b = stock_twin(a, stock)
     ends = []
-    for model in (a, b):
+    for model in (a, by_torch(make(ours, [8])), stock_twin(a, stock)):
         train(model, 3)
         ends.append((th.rand(1).item(), np.random.rand()))  # noqa: NPY002
-    assert ends[0] == ends[1]
+    assert ends[0] == ends[1] == ends[2]
 
 
 @pytest.mark.parametrize("ours, stock", [(OptionDDPG, DDPG), (OptionTD3, TD3)])
@@ -124,12 +120,12 @@ def test_observations_of_two_dimensions_and_three_critics():
 
 
 def test_optimizer_settings_are_respected():
-    settings = {"optimizer_kwargs": {"betas": (0.8, 0.99), "eps": 1e-5, "weight_decay": 1e-2}}
+    settings = {"optimizer_kwargs": {"betas": (0.8, 0.99), "eps": 1e-5}}
     a, b = make(OptionDDPG, [16], policy_kwargs=settings), make(DDPG, [16], policy_kwargs=settings)
     a.actor_learning_rate = a.critic_learning_rate = b.learning_rate
     for model in (a, b):
         train(model, 30)
-    assert isinstance(a._fast_update, FastUpdate)
+    assert a.update_path == "kernel"
     assert distance(a, b) <= 1e-5
 
 
@@ -159,12 +155,10 @@ def test_loading_into_a_model_that_has_trained():
     a, b = make(OptionTD3, [16]), make(OptionTD3, [16], seed=5)
     train(a, 7)
     train(b, 4)
-    fast = b._fast_update
     b.set_parameters(copy.deepcopy(a.get_parameters()))
     b._n_updates = a._n_updates
     for model in (a, b):
         train(model, 7, seed=2)
-    assert b._fast_update is fast
     assert same(a, b)
 
 
@@ -240,7 +234,7 @@ def test_default_learning_rates_are_the_papers_and_replace_sb3s():
 @pytest.mark.parametrize("cls", [OptionDDPG, OptionTD3])
 def test_learns_by_itself_and_round_trips(cls, tmp_path):
     model = cls("MlpPolicy", "Pendulum-v1", policy_kwargs={"net_arch": [16]}, buffer_size=500, seed=0).learn(300)
-    assert isinstance(model._fast_update, FastUpdate)
+    assert model.update_path == "kernel"
     model.save(tmp_path / "model.zip")
     loaded = cls.load(tmp_path / "model.zip", env=model.get_env())
     observation = np.ones((4, 3), np.float32)
@@ -253,8 +247,9 @@ def test_learns_by_itself_and_round_trips(cls, tmp_path):
     "policy_kwargs, reason",
     [
         ({"activation_fn": th.nn.Tanh}, "Linear and ReLU"),
-        ({"optimizer_class": th.optim.SGD}, "SGD"),
+        ({"optimizer_class": th.optim.SGD}, "not Adam"),
         ({"optimizer_kwargs": {"amsgrad": True}}, "amsgrad"),
+        ({"optimizer_kwargs": {"weight_decay": 1e-2}}, "weight_decay"),
     ],
 )
 def test_what_is_not_covered_falls_back_with_one_warning(policy_kwargs, reason):
@@ -269,7 +264,7 @@ def test_what_is_not_covered_falls_back_with_one_warning(policy_kwargs, reason):
             train(model, 5)
     ours = [str(warning.message) for warning in caught if "slower update" in str(warning.message)]
     assert len(ours) == 1 and reason in ours[0]
-    assert a._fast_update is None
+    assert a.update_path == "reference"
     assert distance(a, b) == 0
 
 
@@ -331,21 +326,79 @@ def test_numpy_actor_asks_torch_about_other_networks():
         assert np.allclose(actor.act(observations), model.predict(observations, deterministic=True)[0], atol=1e-6)
 
 
+@pytest.mark.parametrize("path", ["kernel", "reference"])
 @pytest.mark.parametrize("ours", [OptionDDPG, OptionTD3])
-def test_the_saturation_penalty_is_the_mean_squared_norm_before_the_tanh(ours):
-    model = make(ours, [64, 64], policy_kwargs={"net_arch": [64, 64]}, saturation_penalty=0.1)
+def test_the_saturation_penalty_is_the_mean_squared_norm_before_the_tanh(ours, path):
+    """The first moments of Adam after one update are a tenth of the gradient."""
+    model = make(ours, [64, 64], saturation_penalty=0.1, critic_learning_rate=0.0)
+    model.policy_delay = 1
+    if path == "reference":
+        by_torch(model)
     with th.no_grad():
         model.actor.mu[-2].bias.fill_(2.0)
+    np.random.seed(1)  # noqa: NPY002
     data = model.replay_buffer.sample(32)
-    settings = StepSettings(0.99, 0.0, 0.0, 0.0, 0.1)
-    fast = FastUpdate(model.policy)
-    gradients = []
-    fast.actor_adam.step = gradients.extend  # look at the gradients, learn nothing
-    fast.critic_adam.step = lambda _: None
-    fast.step(data, settings, with_actor=True)
     before_tanh = model.actor.mu[:-1](data.observations)
-    actions = before_tanh.tanh()
-    loss = -model.critic.q1_forward(data.observations, actions).mean() + 0.1 * before_tanh.pow(2).sum(dim=1).mean()
+    value = model.critic.q1_forward(data.observations, before_tanh.tanh()).mean()
+    loss = -value + 0.1 * before_tanh.pow(2).sum(dim=1).mean()
     expected = th.autograd.grad(loss, list(model.actor.mu.parameters()))
-    for gradient, theirs in zip(gradients, expected, strict=True):
-        np.testing.assert_allclose(gradient.numpy(), theirs.numpy(), atol=1e-6)
+    train(model, 1, seed=1)
+    assert model.update_path == path
+    assert model.logger.name_to_value["train/actor_loss"] == pytest.approx(loss.item(), rel=1e-5)
+    for state, gradient in zip(model.actor.optimizer.state.values(), expected, strict=True):
+        np.testing.assert_allclose(10 * state["exp_avg"].numpy(), gradient.numpy(), atol=1e-6)
+
+
+def test_a_saturation_penalty_needs_a_tanh_that_can_be_told_from_the_rest():
+    model = by_torch(make(OptionDDPG, [8], saturation_penalty=0.1))
+    model.actor.mu = model.actor.mu[:-1]
+    with pytest.raises(ValueError, match="saturation_penalty"):
+        train(model, 1)
+    model.saturation_penalty = 0.0
+    train(model, 1)
+
+
+@pytest.mark.parametrize("path", ["kernel", "reference"])
+def test_denormal_numbers_are_flushed_and_the_flag_restored(path):
+    model = make(OptionDDPG, [16, 16])
+    if path == "reference":
+        by_torch(model)
+    train(model, 1)
+    with th.no_grad():
+        model.critic.q_networks[0][0].bias.fill_(-1e6)  # no unit of the first layer lives: no gradient for its weights
+    moment = model.critic.optimizer.state[model.critic.q_networks[0][0].weight]["exp_avg"]
+    moment.fill_(1e-40)
+    assert moment.view(th.int32).all()
+    train(model, 1)
+    assert not moment.view(th.int32).any()
+    assert (th.tensor(1e-38) * 0.01).view(th.int32).item() != 0
+
+
+def test_without_numba_the_reference_learns_and_says_so_once(monkeypatch):
+    learner_module._warn_once.cache_clear()
+    monkeypatch.delitem(sys.modules, "sb3_skillgraph.options.compiled_update", raising=False)
+    monkeypatch.delitem(sys.modules, "sb3_skillgraph.options.kernel", raising=False)
+    monkeypatch.delattr("sb3_skillgraph.options.kernel", raising=False)
+    monkeypatch.setitem(sys.modules, "numba", None)
+    a, b = make(OptionTD3, [16]), by_torch(make(OptionTD3, [16]))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        for model in (a, b, make(OptionTD3, [16])):
+            train(model, 4)
+            train(model, 4)
+    hints = [str(warning.message) for warning in caught if "numba" in str(warning.message)]
+    assert len(hints) == 1 and 'pip install "sb3_skillgraph[fast]"' in hints[0]
+    assert a.update_path == "reference"
+    assert same(a, b)
+
+
+def test_importing_the_package_does_not_import_numba():
+    code = "import sys, sb3_skillgraph, sb3_skillgraph.options.learner; sys.exit('numba' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_no_steps_are_no_updates():
+    model = make(OptionDDPG, [16])
+    train(model, 0)
+    assert model._n_updates == 0
+    assert "train/critic_loss" not in model.logger.name_to_value

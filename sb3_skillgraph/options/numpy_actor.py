@@ -2,13 +2,13 @@
 
 import numpy as np
 import torch as th
+from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.sac.policies import Actor as SACActor
 from stable_baselines3.td3.policies import Actor
 from torch import nn
-
-from sb3_skillgraph.options.plain_networks import is_plain, is_vector_space, linears
 
 
 class NumpyActor:
@@ -53,7 +53,7 @@ class NumpyActor:
         # Moving a module or giving it other data leaves the old memory behind; the addresses tell.
         self._addresses = [parameter.data_ptr() for parameter in self._parameters]
         self._layers = [
-            (linear.weight.detach().numpy().T, linear.bias.detach().numpy()) for linear in _plain_linears(self.actor)
+            (linear.weight.detach().numpy().T, linear.bias.detach().numpy()) for linear in plain_linears(self.actor)
         ]
 
     def _act_by_torch(self, observations: np.ndarray) -> np.ndarray:
@@ -62,7 +62,40 @@ class NumpyActor:
         return actions.cpu().numpy()
 
 
-def _plain_linears(actor: BasePolicy) -> list[nn.Linear]:
+def is_vector_space(space: spaces.Space) -> bool:
+    """
+    :param space: an observation space
+    :return: whether SB3 hands observations of it to a network as they are, flattened
+    """
+    return isinstance(space, spaces.Box) and len(space.shape) > 0 and not is_image_space(space)
+
+
+def is_plain(network: nn.Module, squashed: bool = False) -> bool:
+    """
+    :param network: any module
+    :param squashed: whether a Tanh must follow the last layer
+    :return: whether it is Linear layers with biases, float32 and contiguous, and a ReLU between one and the next
+    """
+    if type(network) is not nn.Sequential:
+        return False
+    modules = list(network)
+    if squashed and (not modules or type(modules.pop()) is not nn.Tanh):
+        return False
+    linears, relus = modules[::2], modules[1::2]
+    return (
+        len(modules) % 2 == 1
+        and all(type(module) is nn.ReLU for module in relus)
+        and all(type(module) is nn.Linear and module.bias is not None for module in linears)
+        and all(parameter.dtype == th.float32 and parameter.is_contiguous() for parameter in network.parameters())
+    )
+
+
+def plain_linears(actor: BasePolicy) -> list[nn.Linear]:
+    """
+    :param actor: of TD3, DDPG or SAC
+    :return: the linear layers, first to last, that its deterministic action is made of with ReLUs between and a Tanh last;
+        none if it is made of anything else, or not on a CPU
+    """
     if type(actor.features_extractor) is not FlattenExtractor or not is_vector_space(actor.observation_space):
         return []
     if actor.device.type != "cpu":
@@ -74,4 +107,6 @@ def _plain_linears(actor: BasePolicy) -> list[nn.Linear]:
         network = actor.mu
     else:
         return []
-    return linears(network) if is_plain(network, squashed=True) else []
+    if not is_plain(network, squashed=True):
+        return []
+    return [module for module in network if isinstance(module, nn.Linear)]

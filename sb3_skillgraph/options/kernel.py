@@ -1,0 +1,232 @@
+"""
+The update of DDPG and TD3 in one compiled function, for networks of Linear and ReLU layers on a CPU.
+
+The numbers are those of ``OptionLearner._update_by_torch``, which is the one to read first. BLAS does the matrix
+products (``np.dot``) and loops do all else; what belongs to a layer is touched while it is in the cache.
+"""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+Network = list[np.ndarray]  # weight (out, in) and bias (1, out) of each layer
+Learner = list[Network]  # a network, its target, both moments of Adam, its numbers of steps
+Arrays = tuple[tuple[np.ndarray, ...], ...]  # a learner in the form that numba takes from Python
+Rates = tuple[float, float, float, float, float]  # Adam's learning rate, betas and epsilon; tau, 0 for no target to move
+# Observations, actions, next observations, noise on next actions, rewards, discounts (0 after an end): (batch, width).
+Batch = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+
+
+def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
+    """
+    Have numba compile a function when it is first called, and keep the result on disk where it finds a place for it.
+
+    :param function: one that numba understands
+    :return: the same in machine code
+    """
+    # NumPy's division does not check for zeros, which lets loops be vectorised.
+    try:
+        return njit(function, cache=True, error_model="numpy")
+    except RuntimeError:
+        return njit(function, error_model="numpy")
+
+
+@compiled
+def forward(network: Network, inputs: np.ndarray) -> list[np.ndarray]:
+    """
+    :param network: its layers, with a ReLU between one and the next
+    :param inputs: (batch, in)
+    :return: what every layer was given, and last what the network returns: (batch, out)
+    """
+    values = [inputs]
+    for k in range(0, len(network), 2):
+        weight, bias = network[k], network[k + 1]
+        is_last = k == len(network) - 2
+        outputs = np.dot(values[-1], weight.T)
+        for i in range(outputs.shape[0]):
+            for j in range(outputs.shape[1]):
+                outputs[i, j] += bias[0, j]
+                if outputs[i, j] < 0 and not is_last:
+                    outputs[i, j] = 0
+        values.append(outputs)
+    return values
+
+
+@compiled
+def back_to_relu(gradient: np.ndarray, weight: np.ndarray, inputs: np.ndarray) -> np.ndarray:
+    """
+    :param gradient: (batch, out), of the loss by what a layer returned
+    :param weight: (out, in), the layer's
+    :param inputs: (batch, in), what a ReLU gave the layer
+    :return: (batch, in), of the loss by what the ReLU was given
+    """
+    result = np.dot(gradient, weight)
+    for i in range(result.shape[0]):
+        for j in range(result.shape[1]):
+            if inputs[i, j] <= 0:
+                result[i, j] = 0
+    return result
+
+
+@compiled
+def column_sums(gradient: np.ndarray) -> np.ndarray:
+    """
+    :param gradient: (batch, out)
+    :return: (1, out)
+    """
+    sums = np.zeros((1, gradient.shape[1]), np.float32)
+    for i in range(gradient.shape[0]):
+        for j in range(gradient.shape[1]):
+            sums[0, j] += gradient[i, j]
+    return sums
+
+
+@compiled
+def step(learner: Learner, k: int, gradient: np.ndarray, rates: Rates) -> None:
+    """
+    Take one step of Adam, then move the target.
+
+    :param learner: all of its arrays
+    :param k: which parameter learns
+    :param gradient: of the loss by the parameter, of its shape
+    :param rates: of Adam and of the target
+    """
+    parameter, target, average, square, count = learner[0][k], learner[1][k], learner[2][k], learner[3][k], learner[4][k]
+    learning_rate, beta1, beta2, epsilon, tau = rates
+    count[0, 0] += 1
+    # All of these in double before they are rounded: 1 - beta2 would have three digits in single precision.
+    new_average, old_square, new_square = np.float32(1 - beta1), np.float32(beta2), np.float32(1 - beta2)
+    rate = np.float32(learning_rate / (1 - beta1 ** count[0, 0]))
+    correction = np.float32(1 / math.sqrt(1 - beta2 ** count[0, 0]))
+    small, new_target, old_target = np.float32(epsilon), np.float32(tau), np.float32(1 - tau)
+    for i in range(parameter.shape[0]):
+        for j in range(parameter.shape[1]):
+            average[i, j] += new_average * (gradient[i, j] - average[i, j])
+            square[i, j] = old_square * square[i, j] + new_square * gradient[i, j] * gradient[i, j]
+            parameter[i, j] -= rate * average[i, j] / (np.sqrt(square[i, j]) * correction + small)
+        if tau > 0:
+            for j in range(parameter.shape[1]):
+                target[i, j] = old_target * target[i, j] + new_target * parameter[i, j]
+
+
+@compiled
+def backward(learner: Learner, values: list[np.ndarray], gradient: np.ndarray, rates: Rates) -> None:
+    """
+    Teach a network, its last layer first.
+
+    :param learner: the network and what belongs to it
+    :param values: what ``forward`` returned
+    :param gradient: (batch, out), of the loss by what the network returned
+    :param rates: of Adam and of the target
+    """
+    for layer in range(len(values) - 2, -1, -1):
+        weight_gradient = np.dot(gradient.T, values[layer])
+        bias_gradient = column_sums(gradient)
+        if layer > 0:
+            # Before the weight learns: the gradient is that of the weight in use.
+            gradient = back_to_relu(gradient, learner[0][2 * layer], values[layer])
+        step(learner, 2 * layer, weight_gradient, rates)
+        step(learner, 2 * layer + 1, bias_gradient, rates)
+
+
+@compiled
+def update_critics(batch: Batch, actor_target: Network, critics: list[Learner], rates: Rates) -> float:
+    """
+    Teach all critics the same values.
+
+    :param batch: what they learn from
+    :param actor_target: the target of the actor
+    :param critics: one or more
+    :param rates: of the critics
+    :return: the mean squared error, summed over critics
+    """
+    observations, actions, next_observations, noise, rewards, discounts = batch
+    # Select actions by the target of the actor, and add noise.
+    next_actions = np.tanh(forward(actor_target, next_observations)[-1])
+    next_actions = np.minimum(np.maximum(next_actions + noise, np.float32(-1)), np.float32(1))
+    next_inputs = np.concatenate((next_observations, next_actions), axis=1)
+    # The next values are the smallest that a critic's target gives.
+    next_values = np.full((len(noise), 1), np.float32(np.inf))
+    for critic in critics:
+        next_values = np.minimum(next_values, forward(critic[1], next_inputs)[-1])
+    values_wanted = rewards + discounts * next_values
+    # Move each critic towards them.
+    inputs = np.concatenate((observations, actions), axis=1)
+    loss = 0.0
+    for critic in critics:
+        values = forward(critic[0], inputs)
+        error = values[-1] - values_wanted
+        loss += np.mean(error * error)
+        backward(critic, values, error * np.float32(2 / len(error)), rates)
+    return loss
+
+
+@compiled
+def update_actor(observations: np.ndarray, actor: Learner, critic: Network, penalty: float, rates: Rates) -> float:
+    """
+    Teach the actor to climb a critic.
+
+    :param observations: (batch, observation)
+    :param actor: the actor
+    :param critic: the critic
+    :param penalty: weight, in the loss, of the mean squared norm of what the actor's tanh is given
+    :param rates: of the actor
+    :return: the loss
+    """
+    batch = len(observations)
+    values = forward(actor[0], observations)
+    before_tanh = values[-1]
+    actions = np.tanh(before_tanh)
+    critic_values = forward(critic, np.concatenate((observations, actions), axis=1))
+    loss = -np.mean(critic_values[-1]) + penalty * np.sum(before_tanh * before_tanh) / batch
+    # Go back through the critic, which does not learn, to the actions among its inputs.
+    gradient = np.full((batch, 1), np.float32(-1 / batch))
+    for layer in range(len(critic_values) - 2, 0, -1):
+        gradient = back_to_relu(gradient, critic[2 * layer], critic_values[layer])
+    gradient = np.dot(gradient, critic[0])[:, observations.shape[1] :]
+    # Go back through the tanh, before which the penalty comes in.
+    gradient = gradient * (np.float32(1) - actions * actions) + np.float32(2 * penalty / batch) * before_tanh
+    backward(actor, values, gradient, rates)
+    return loss
+
+
+@compiled
+def as_lists(arrays: Arrays) -> Learner:
+    """
+    :param arrays: a learner
+    :return: the same in lists, whose type does not depend on their length: less to compile for another network
+    """
+    return [[array for array in network] for network in arrays]
+
+
+@compiled
+def update(
+    batch: Batch,
+    actor: Arrays,
+    critics: tuple[Arrays, ...],
+    actor_rates: Rates,
+    critic_rates: Rates,
+    penalty: float,
+    with_actor: bool,
+) -> tuple[float, float]:
+    """
+    Do one update.
+
+    :param batch: what they learn from
+    :param actor: the actor
+    :param critics: one or more
+    :param actor_rates: of the actor
+    :param critic_rates: of the critics
+    :param penalty: see ``update_actor``
+    :param with_actor: whether the actor learns, too
+    :return: the critics' loss and the actor's (NaN without the actor)
+    """
+    actor_learner = as_lists(actor)
+    critic_learners = [as_lists(critic) for critic in critics]
+    critic_loss = update_critics(batch, actor_learner[1], critic_learners, critic_rates)
+    if not with_actor:
+        return critic_loss, math.nan
+    return critic_loss, update_actor(batch[0], actor_learner, critic_learners[0][0], penalty, actor_rates)
