@@ -154,7 +154,7 @@ class SkillGraphAgent(OffPolicyAlgorithm):
         )
         self._interrupts = Interrupts()
         self._env_snapshot: dict[str, Any] | None = None
-        self._loaded = False
+        self._loaded = ""  # by which update a loaded agent was trained
         if self.env is not None:
             self._spec = GoalSpec.of(self.observation_space, self.action_space)
         if _init_setup_model:
@@ -376,7 +376,7 @@ class SkillGraphAgent(OffPolicyAlgorithm):
 
     def _running_state(self, n_envs: int, state: tuple[np.ndarray, ...] | None) -> RunnerState:
         if state is None:
-            return RunnerState.fresh(n_envs, self._spec.goal_dim)
+            return RunnerState.fresh(n_envs, self._spec.goal_dim, self._spec.observation_dim)
         if len(state) != len(RunnerState._fields) or len(state[0]) != n_envs:
             raise ValueError(f"The state is not one that predict has returned for {n_envs} environments.")
         return RunnerState(*state)
@@ -533,4 +533,4 @@ class SkillGraphAgent(OffPolicyAlgorithm):
         refuse_vec_normalize(env)
         super().set_env(env, force_reset)
         if force_reset:
-            self._env_snapshot, self._loaded = None, False
+            self._env_snapshot, self._loaded = None, ""

@@ -6,7 +6,7 @@ import numpy as np
 
 from sb3_skillgraph.edges import NOWHERE, land
 from sb3_skillgraph.graph import SkillGraph
-from sb3_skillgraph.walk_model import Kind, WalkModel
+from sb3_skillgraph.walk_model import Kind, WalkModel, timeout
 
 #: What to count on for the success of options, in standard deviations above what is expected: while learning, so that what is
 #: unknown is tried, and otherwise, so that it is not relied upon.
@@ -74,6 +74,7 @@ class Choices(NamedTuple):
     :param successes: weight of its runs that succeeded
     :param failures: weight of those that failed
     :param steps: environment steps of a successful run
+    :param failed_steps: of a failed one
     :param loss: share of the failures of its kind that end far away
     :param landing: vertices in which failed runs landed, shape ``(n, MAX_LANDINGS)``
     :param weight: weight of those, same shape
@@ -85,6 +86,7 @@ class Choices(NamedTuple):
     successes: np.ndarray
     failures: np.ndarray
     steps: np.ndarray
+    failed_steps: np.ndarray
     loss: np.ndarray
     landing: np.ndarray
     weight: np.ndarray
@@ -166,9 +168,11 @@ class ChoiceModel:
         guess = self._with_kin(self.model.success(kinds), hasty, successes, successes + failures)
         # A guess of the steps counts for one run.
         steps = (self.model.steps(kinds) + edges.success_steps * aging) / (1.0 + successes)
+        failed_steps = (self.model.patience * timeout(steps) + edges.failure_steps * aging) / (1.0 + failures)
         loss = self._with_kin(self._loss(kinds), hasty, self.far_failures(kinds), failures)
         weight = edges.landing_weight * aging[:, None]
-        return Choices(edges.source, edges.target, guess, successes, failures, steps, loss, edges.landing, weight)
+        times = (steps, failed_steps)
+        return Choices(edges.source, edges.target, guess, successes, failures, *times, loss, edges.landing, weight)
 
     def _loss(self, kinds: Kind) -> np.ndarray:
         return np.where(self.model.is_hasty(kinds), self.model.loss[0], self.model.loss[1])
@@ -303,13 +307,14 @@ class ChoiceModel:
         kind = Kind(radii, seen * self.model.steps_per_radius * radii, seen, np.zeros(n))
         landing = np.full((n, self.graph.edges.landing.shape[1]), NOWHERE)
         targets = np.broadcast_to(np.asarray(target), (n,)).copy()
-        zeros = (np.zeros(n), np.zeros(n))
+        zeros, steps = (np.zeros(n), np.zeros(n)), self.model.steps(kind)
         guessed = Choices(
             source,
             targets,
             self.model.success(kind),
             *zeros,
-            self.model.steps(kind),
+            steps,
+            self.model.patience * timeout(steps),
             self._loss(kind),
             landing,
             np.zeros(landing.shape),

@@ -9,7 +9,9 @@ NOWHERE = -1
 MAX_LANDINGS = 4
 
 _INDICES, _LANDINGS = ("source", "target"), ("landing", "landing_weight")
-_NUMBERS = ("forward", "backward", "crossing_steps", "successes", "success_steps", "failures", "updated")
+#: What runs write into a record: it ages.
+RECORD = ("successes", "success_steps", "failures", "failure_steps")
+_NUMBERS = ("forward", "backward", "crossing_steps", *RECORD, "updated")
 
 
 class Edges:
@@ -67,6 +69,11 @@ class Edges:
     def failures(self) -> np.ndarray:
         """Runs that failed, weighted by age."""
         return self._arrays["failures"][: self.size]
+
+    @property
+    def failure_steps(self) -> np.ndarray:
+        """Environment steps of those, summed with the same weights."""
+        return self._arrays["failure_steps"][: self.size]
 
     @property
     def updated(self) -> np.ndarray:

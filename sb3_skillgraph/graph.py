@@ -5,7 +5,7 @@ from typing import Any
 import networkx
 import numpy as np
 
-from sb3_skillgraph.edges import NOWHERE, Edges, land
+from sb3_skillgraph.edges import NOWHERE, RECORD, Edges, land
 from sb3_skillgraph.events import Event
 
 #: Landmarks lie at least so many event radii apart: 1.5 to 3 make the same agent, fewer make plans cheaper.
@@ -20,7 +20,7 @@ YOUNG = 500.0
 GROWTH = 1.25
 
 #: What the picture of an edge shows of its record.
-_SHOWN = ("forward", "backward", "crossing_steps", "successes", "success_steps", "failures")
+_SHOWN = ("forward", "backward", "crossing_steps", *RECORD)
 
 
 class SkillGraph:
@@ -163,7 +163,7 @@ class SkillGraph:
         edges.crossing_steps[new] = steps / max(n_old + n_new, 1.0)
         edges.forward[new] += old.forward[row]
         edges.backward[new] += old.backward[row]
-        for name in ("successes", "success_steps", "failures"):
+        for name in RECORD:
             getattr(edges, name)[new] += weight * getattr(old, name)[row]
         for landing, share in zip(old.landing[row].tolist(), old.landing_weight[row].tolist(), strict=True):
             if share > 0.0:
@@ -205,6 +205,7 @@ class SkillGraph:
             edges.success_steps[row] += steps
         else:
             edges.failures[row] += 1.0
+            edges.failure_steps[row] += steps
             self._land(row, landing, 1.0)
         self.version += 1
 
@@ -212,8 +213,8 @@ class SkillGraph:
         """Return the row of an edge, its weights as of now."""
         row, edges = self.edges.add(source, target, self.now), self.edges
         weight = self._aging(edges.updated[row])
-        for column in (edges.successes, edges.success_steps, edges.failures, edges.landing_weight):
-            column[row] *= weight
+        for name in (*RECORD, "landing_weight"):
+            getattr(edges, name)[row] *= weight
         edges.updated[row] = self.now
         return row
 

@@ -2,6 +2,7 @@
 
 import io
 import random
+import warnings
 from collections import deque
 from collections.abc import Iterable
 from copy import deepcopy
@@ -19,7 +20,7 @@ from stable_baselines3.common.utils import check_for_correct_spaces
 
 from sb3_skillgraph.goal_env import refuse_vec_normalize
 from sb3_skillgraph.memory.store import TransitionStore
-from sb3_skillgraph.options.learner import OptionDDPG, OptionTD3
+from sb3_skillgraph.options.learner import OptionDDPG, OptionLearner, OptionTD3
 from sb3_skillgraph.saving import MissingCallable, PathOrFile, known_class, load_tree
 
 for _option_class in (OptionDDPG, OptionTD3):
@@ -43,11 +44,16 @@ def agent_tree(agent: Any, left_out: Iterable[str]) -> dict[str, Any]:
         "n_envs": agent.n_envs,
         "horizon": parts.planner.horizon,
         "walker": parts.walker.learner._n_updates,
+        "update_path": _update_path(parts.walker.learner),
         "parameters": agent.get_parameters(),
         "graph": parts.graph.get_state(),
         "model": parts.model.get_state(),
         "progress": _progress(agent),
     }
+
+
+def _update_path(learner: OffPolicyAlgorithm) -> str:
+    return learner.update_path if isinstance(learner, OptionLearner) else "reference"
 
 
 def _arguments(agent: Any) -> dict[str, Any]:
@@ -138,7 +144,7 @@ def _build(cls: Any, tree: dict[str, Any], env: Any, device: Any, given: dict[st
         agent.action_noise = noise.base_noise
     agent._setup_model()
     _restore(agent, tree, same_envs=agent.n_envs == tree["n_envs"] and not force_reset)
-    agent._loaded = True
+    agent._loaded = tree["update_path"]
     return agent
 
 
@@ -191,7 +197,14 @@ def restore_env(agent: Any) -> bool:
     :return: whether they were
     """
     snapshot, agent._env_snapshot = agent._env_snapshot, None
-    loaded, agent._loaded = agent._loaded, False
+    loaded, agent._loaded = agent._loaded, ""
+    path = _update_path(agent.parts.walker.learner) if loaded else ""
+    if path != loaded:
+        warnings.warn(
+            f"The walker was trained by the {loaded} update and goes on with the {path} update: their numbers differ in the "
+            "last digits, so that learning does not go on exactly as it would have.",
+            stacklevel=5,
+        )
     if loaded and agent.verbose and snapshot is None:
         print("The environments' states are not known (no get_state/set_state): learning resumes at a fresh episode.")
     if snapshot is None or agent.env is None or not agent.env.has_attr("set_state"):

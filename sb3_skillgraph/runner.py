@@ -12,11 +12,15 @@ from sb3_skillgraph.edges import NOWHERE
 from sb3_skillgraph.graph import SkillGraph
 from sb3_skillgraph.options.numpy_actor import NumpyActor
 from sb3_skillgraph.options.views import View
-from sb3_skillgraph.planning import DIRECT, GOAL, Planner, Solution, timeout
+from sb3_skillgraph.planning import DIRECT, GOAL, Planner, Solution
+from sb3_skillgraph.walk_model import timeout
 
 #: Different runs of an episode that are told apart; more are counted with others that began with the same option.
 MAX_RUNS = 256
 ID = "U16"  # NumPy's type of ids
+#: An agent stands still whose observation changes, in so many steps in a row, by less than this share of the largest change
+#: in a step of its episode: what a policy without noise does there it will do for ever.
+STILL_STEPS, STILL = 8, 0.01
 
 
 class RunnerState(NamedTuple):
@@ -31,6 +35,9 @@ class RunnerState(NamedTuple):
     :param timeout: environment steps it may run
     :param arrived: id of the event that the last option has led to, where the next one begins; empty after a failure
     :param elapsed: environment steps of the episode so far
+    :param seen: the last observation, shape ``(n_envs, observation_dim)``
+    :param pace: the largest change of an observation in one step of the episode
+    :param still: steps of the running option in a row in which hardly anything has changed
     :param run_event: the episode's runs: where they began, shape ``(n_envs, MAX_RUNS)`` like all that follow
     :param run_option: which option it was, empty where there is no run
     :param run_landing: in which event it ended, or ``goal``
@@ -46,6 +53,9 @@ class RunnerState(NamedTuple):
     timeout: np.ndarray
     arrived: np.ndarray
     elapsed: np.ndarray
+    seen: np.ndarray
+    pace: np.ndarray
+    still: np.ndarray
     run_event: np.ndarray
     run_option: np.ndarray
     run_landing: np.ndarray
@@ -54,11 +64,12 @@ class RunnerState(NamedTuple):
     run_count: np.ndarray
 
     @classmethod
-    def fresh(cls, n_envs: int, goal_dim: int) -> "RunnerState":
+    def fresh(cls, n_envs: int, goal_dim: int, observation_dim: int) -> "RunnerState":
         """Return the state at the start of an episode."""
         ids, numbers = np.zeros(n_envs, dtype=ID), np.zeros(n_envs)
+        aim, seen = (np.zeros((n_envs, dim), dtype=np.float32) for dim in (goal_dim, observation_dim))
         run_ids, run_numbers = np.zeros((n_envs, MAX_RUNS), dtype=ID), np.zeros((n_envs, MAX_RUNS))
-        running = (ids, ids, np.zeros((n_envs, goal_dim), dtype=np.float32), numbers, numbers, ids, numbers)
+        running = (ids, ids, aim, numbers, numbers, ids, numbers, seen, numbers, numbers)
         return cls(*running, run_ids, run_ids, run_ids, run_numbers.astype(bool), run_numbers, run_numbers)
 
     def begun_anew(self, where: np.ndarray) -> "RunnerState":
@@ -66,7 +77,7 @@ class RunnerState(NamedTuple):
 
         :param where: for which, bool array of shape ``(n_envs,)``
         """
-        fresh = RunnerState.fresh(len(where), self.aim.shape[1])
+        fresh = RunnerState.fresh(len(where), self.aim.shape[1], self.seen.shape[1])
         pairs = zip(fresh, self, strict=True)
         return RunnerState(*(np.where(where.reshape(-1, *[1] * (new.ndim - 1)), new, old) for new, old in pairs))
 
@@ -184,6 +195,7 @@ class Runner:
         :return: actions scaled to [-1, 1], shape ``(n_envs, action_dim)``, and the state after the step
         """
         points = observation["achieved_goal"]
+        state = self._with_stillness(state, observation["observation"])
         idle = np.flatnonzero(state.option == "").tolist()
         if idle:
             state = state.copy()
@@ -192,6 +204,15 @@ class Runner:
             self.begin(state, i, self.decide(state, i, start, goals[i], stance), start, goals[i])
         actions = self.actor.act(self.view(observation["observation"], points, state.aim))
         return actions, state._replace(steps=state.steps + 1, elapsed=state.elapsed + 1)
+
+    @staticmethod
+    def _with_stillness(state: RunnerState, observation: np.ndarray) -> RunnerState:
+        """Return the state with what has changed since the last step; who stands still has no more time."""
+        change = np.where(state.elapsed > 0, np.abs(observation - state.seen).max(axis=1), 0.0)
+        pace = np.maximum(state.pace, change)
+        still = np.where(change < STILL * pace, state.still + 1, 0)
+        no_time = np.where(still >= STILL_STEPS, 0.0, state.timeout)
+        return state._replace(seen=observation.astype(np.float32), pace=pace, still=still, timeout=no_time)
 
     # -- choosing an option -------------------------------------------------------------------------------------------
 
@@ -226,6 +247,7 @@ class Runner:
             state.option[i], state.aim[i] = self.graph.walk_ids[target], self.graph.centers[target]
         state.began[i] = self.graph.id(start.event)
         state.steps[i], state.timeout[i] = 0, timeout(float(solution.episode.steps[first]))
+        state.still[i] = 0
 
     def runs(self, state: RunnerState, i: int) -> Runs:
         """Return the episode's runs of one environment as the planner takes them; those of forgotten events are left out."""

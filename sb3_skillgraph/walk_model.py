@@ -19,6 +19,13 @@ HASTY_GUESS, HASTY_LOSS = 0.1, 0.5
 #: Least standard deviation of a feature: what never varies tells nothing.
 LEAST_SCALE = 0.1
 N_FEATURES = 7
+#: Environment steps of failed runs that the first guess of their length counts for.
+PATIENCE_PRIOR = 100.0
+
+
+def timeout(steps: Any) -> Any:
+    """Return the environment steps that a run may take which is expected to succeed in ``steps``: a number, or an array."""
+    return 2.0 * steps + 15.0
 
 
 class Kind(NamedTuple):
@@ -79,6 +86,7 @@ class WalkModel:
         self.steps_per_radius = 5.0  # of walks where nobody has gone
         self.fastest = 0.0  # steps that the fastest walks take for a radius
         self.loss = np.array([HASTY_LOSS, 0.0])
+        self.patience = 1.0  # share of the steps it may take that a failed run takes: less where agents come to stand still
         self.version = 0  # rises with every change
 
     def success(self, kind: Kind) -> np.ndarray:
@@ -107,6 +115,17 @@ class WalkModel:
             return
         self._fit_pace(kind, successes, success_steps)
         self._fit_success(kind, successes, failures)
+        self.version += 1
+
+    def fit_failures(self, loss: np.ndarray, taken: float, allowed: float) -> None:
+        """Learn from failed runs.
+
+        :param loss: share of them that ended far away, of hasty walks and of others, shape ``(2,)``
+        :param taken: environment steps that they took together
+        :param allowed: environment steps that they might have taken
+        """
+        self.loss = loss
+        self.patience = (taken + PATIENCE_PRIOR) / (allowed + PATIENCE_PRIOR)
         self.version += 1
 
     def _fit_success(self, kind: Kind, successes: np.ndarray, failures: np.ndarray) -> None:

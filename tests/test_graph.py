@@ -474,7 +474,8 @@ def test_the_networkx_graph_carries_records_and_where_runs_landed() -> None:
     assert drawn.nodes["e2"] == {"kind": "event", "salient": True, "radius": 1.0, "x0": 4.0, "x1": 0.0}
     assert drawn.nodes["w2"] == {"kind": "walk", "target": "e2"}
     assert drawn.edges["e0", "w1"] == {
-        "forward": 1.0, "backward": 0.0, "crossing_steps": 10.0, "successes": 1.0, "success_steps": 8.0, "failures": 1.0
+        "forward": 1.0, "backward": 0.0, "crossing_steps": 10.0, "successes": 1.0, "success_steps": 8.0, "failures": 1.0,
+        "failure_steps": 35.0,
     }  # fmt: skip
     assert drawn.edges["w1", "e1"]["rate"] == pytest.approx(0.25)
     assert drawn.edges["w1", "e2"]["rate"] == pytest.approx(0.5)

@@ -203,7 +203,6 @@ def test_a_way_is_looked_for_to_a_goal_where_nobody_has_been() -> None:
     missions = make_missions(line_graph(3))
     missions.pinned = np.array([12.0, 3.0])
     found = drawn(missions, 200)
-    straight = [mission for mission in found if mission.goal.tolist() == [12.0, 3.0]]
     looking = [mission for mission in found if mission.goal.tolist() != [12.0, 3.0]]
     assert 60 < len(looking) < 140
     assert all(mission.explore_steps == EXPLORATION for mission in looking)

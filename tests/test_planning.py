@@ -30,9 +30,9 @@ from sb3_skillgraph.choices import (
 from sb3_skillgraph.edges import MAX_LANDINGS, NOWHERE
 from sb3_skillgraph.graph import SkillGraph
 from sb3_skillgraph.plan import Plan, describe
-from sb3_skillgraph.planning import FOR_GOOD, LEAST, LOST_HORIZONS, Planner, Solution, timeout
+from sb3_skillgraph.planning import FOR_GOOD, LEAST, LOST_HORIZONS, Planner, Solution
 from sb3_skillgraph.runner import Runner, RunnerState
-from sb3_skillgraph.walk_model import FIRST_GUESS, WalkModel
+from sb3_skillgraph.walk_model import FIRST_GUESS, WalkModel, timeout
 
 HORIZON = 1_000
 LOST = LOST_HORIZONS * HORIZON
@@ -67,7 +67,8 @@ class Given(NamedTuple):
         failure, none = 1.0 - self.success, np.zeros(len(self.steps))
         counts = OFTEN * self.success, OFTEN * failure
         weight = OFTEN * failure[:, None] * self.share
-        return Choices(self.source, self.target, self.success, *counts, self.steps, none, self.landing, weight)
+        times = self.steps, timeout(self.steps)
+        return Choices(self.source, self.target, self.success, *counts, *times, none, self.landing, weight)
 
 
 class GivenChoices(ChoiceModel):
@@ -794,7 +795,7 @@ def simulate(given: Given, best: dict[int, int], start: int, goal: int, remainin
             row = best[vertex]
             if rng.random() < given.success[row]:
                 vertex, time = int(given.target[row]), time + given.steps[row]
-            elif rng.random() < FOR_GOOD:
+            elif rng.random() < FOR_GOOD * (1.0 - given.success[row]):
                 break
             else:
                 vertex = int(rng.choice(given.landing[row], p=given.share[row]))
@@ -840,7 +841,7 @@ def test_less_time_promises_less() -> None:
     promised = [planner.promise(solution, 0, remaining)[0] for remaining in (20.0, 50.0, 100.0, 2_000.0)]
     assert promised == sorted(promised)
     assert promised[0] == pytest.approx(0.3, abs=0.01)
-    assert promised[-1] == pytest.approx(0.3 / (1.0 - 0.7 * (1.0 - FOR_GOOD)), abs=0.01)
+    assert promised[-1] == pytest.approx(0.3 / (1.0 - 0.7 * (1.0 - 0.7 * FOR_GOOD)), abs=0.01)
 
 
 @pytest.mark.parametrize("remaining", [1.0, 5.0, 9.0])
@@ -873,7 +874,7 @@ def straight_runner(graph: SkillGraph, model: WalkModel | None = None) -> Runner
 
 
 def plan_from(runner: Runner, point: tuple[float, float], goal: tuple[float, float], state: RunnerState | None = None) -> Plan:
-    state = RunnerState.fresh(1, 2) if state is None else state
+    state = RunnerState.fresh(1, 2, 2) if state is None else state
     return describe(runner, state, np.array(point), np.array(goal))
 
 
@@ -911,7 +912,7 @@ def test_a_plan_reads_as_a_sentence() -> None:
 
 
 def running(option: str, *, began: str, elapsed: float = 0.0, steps: float = 0.0) -> RunnerState:
-    fresh = RunnerState.fresh(1, 2)
+    fresh = RunnerState.fresh(1, 2, 2)
     ids = [np.array([id], dtype=fresh.option.dtype) for id in (option, began)]
     return fresh._replace(option=ids[0], began=ids[1], elapsed=np.array([elapsed]), steps=np.array([steps]))
 
@@ -919,7 +920,7 @@ def running(option: str, *, began: str, elapsed: float = 0.0, steps: float = 0.0
 def test_a_plan_begins_with_the_option_that_runs() -> None:
     runner = straight_runner(known_line(), hopeless())
     observation = {"observation": np.zeros((1, 2)), "achieved_goal": np.zeros((1, 2))}
-    _, state = runner.act(observation, np.array([[12.0, 0.0]]), RunnerState.fresh(1, 2))
+    _, state = runner.act(observation, np.array([[12.0, 0.0]]), RunnerState.fresh(1, 2, 2))
     assert state.option.tolist() == ["w1"]
     assert plan_from(runner, (0.0, 0.0), (12.0, 0.0), state).path[0] == "w1"
     assert plan_from(runner, (0.0, 0.0), (12.0, 0.0), running("direct", began="e0")).path == ("direct", "goal")

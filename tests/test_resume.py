@@ -1,7 +1,9 @@
 """Learning that is broken off, saved, and taken up in another process ends exactly where unbroken learning ends."""
 
+import warnings
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import gymnasium as gym
 import numpy as np
@@ -25,6 +27,7 @@ from stable_baselines3.common.vec_env import SubprocVecEnv
 
 from sb3_skillgraph import SkillGraphAgent
 from sb3_skillgraph.hyperparams import load_hyperparams
+from sb3_skillgraph.options.learner import OptionLearner
 
 GO_ON = """
 import sys
@@ -229,6 +232,20 @@ def test_starting_over_forgets_where_the_saved_environment_stood(trained_files: 
     # One episode of 300 steps: the second call goes on where the first stopped.
     assert len(env.starts) == 1
     check_store(agent, env.transitions)
+
+
+def test_going_on_with_the_other_update_is_told(trained_files: tuple[Path, Path]) -> None:
+    """Whose numbers differ in the last digits, so that learning is not exactly what it would have been."""
+    agent = SkillGraphAgent.load(trained_files[0], env=gym.make(TOY))
+    agent.load_replay_buffer(trained_files[1])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        agent.learn(10, reset_num_timesteps=False)
+    agent = SkillGraphAgent.load(trained_files[0], env=gym.make(TOY))
+    agent.load_replay_buffer(trained_files[1])
+    told = pytest.warns(UserWarning, match="trained by the kernel update and goes on with the reference update")
+    with mock.patch.object(OptionLearner, "_compiled_update", lambda learner: None), told:
+        agent.learn(10, reset_num_timesteps=False)
 
 
 @pytest.mark.parametrize("n_envs", [1, 3])

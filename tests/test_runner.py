@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sb3_skillgraph.graph import SkillGraph
-from sb3_skillgraph.planning import Planner, timeout
-from sb3_skillgraph.runner import MAX_RUNS, Run, Runner, RunnerState
-from sb3_skillgraph.walk_model import WalkModel
+from sb3_skillgraph.planning import Planner
+from sb3_skillgraph.runner import MAX_RUNS, STILL_STEPS, Run, Runner, RunnerState
+from sb3_skillgraph.walk_model import WalkModel, timeout
 
 STEP = 0.5
 HORIZON = 1_000
@@ -81,7 +81,7 @@ class Trip:
     ) -> None:
         self.runner, self.may_pass = runner, may_pass
         self.point, self.goal = np.array([start]), np.array([goal])
-        self.state = RunnerState.fresh(1, 2)
+        self.state = RunnerState.fresh(1, 2, 2)
         self.runs: list[Run] = []
         self.options: list[str] = []
 
@@ -108,7 +108,7 @@ class Trip:
 def running(
     option: str, *, began: str = "", aim: tuple[float, float] = (0.0, 0.0), steps: int = 1, may: int = 20
 ) -> RunnerState:
-    fresh = RunnerState.fresh(1, 2)
+    fresh = RunnerState.fresh(1, 2, 2)
     ids = [np.array([id], dtype=fresh.option.dtype) for id in (option, began)]
     aims = np.array([aim], dtype=np.float32)
     return fresh._replace(
@@ -188,7 +188,7 @@ def test_a_walk_to_the_goal_lands_in_the_goal() -> None:
 
 def test_where_nothing_runs_nothing_ends() -> None:
     runner = make_runner(known_line())
-    state = RunnerState.fresh(3, 2)
+    state = RunnerState.fresh(3, 2, 2)
     after, runs = runner.advance(state, np.zeros((3, 2)), [True] * 3)
     assert after is state
     assert runs == []
@@ -197,12 +197,50 @@ def test_where_nothing_runs_nothing_ends() -> None:
 def test_a_run_may_take_the_time_that_its_expected_steps_allow() -> None:
     graph = known_line()
     runner = make_runner(graph)
-    _, state = runner.act(seen_at(np.zeros((1, 2))), np.array([[12.0, 0.0]]), RunnerState.fresh(1, 2))
+    _, state = runner.act(seen_at(np.zeros((1, 2))), np.array([[12.0, 0.0]]), RunnerState.fresh(1, 2, 2))
     walks = runner.planner.choice_model.walks()
     assert state.option[0] == "w1"
     assert state.timeout[0] == pytest.approx(timeout(float(walks.steps[graph.edges.find(0, 1)])))
     assert (state.steps[0], state.elapsed[0]) == (1, 1)
     np.testing.assert_array_equal(state.aim, [[4.0, 0.0]])
+
+
+def test_who_stands_still_has_failed_long_before_the_time_is_up() -> None:
+    graph = line_graph(4)
+    tried(graph, 0, 1, 20)
+    trip = Trip(make_runner(graph), (0.0, 0.0), (12.0, 0.0), wall_at(2.0))
+    while not trip.runs:
+        trip.step()
+    (run,) = trip.runs
+    assert (run.option, run.success, run.landing) == ("w1", False, "e0")
+    assert run.steps <= 4 + STILL_STEPS + 2  # on the way to the wall, standing before it
+    assert trip.state.run_steps.sum() == run.steps
+    # The next option has as much time, although the agent still stands.
+    while len(trip.runs) < 2:
+        trip.step()
+    assert STILL_STEPS <= trip.runs[1].steps <= STILL_STEPS + 3
+
+
+def test_who_moves_slowly_does_not_stand_still() -> None:
+    runner = make_runner(known_line())
+    trip = Trip(runner, (0.0, 0.0), (4.0, 0.0))
+    trip.step()
+    for k in range(3 * STILL_STEPS):
+        trip.point = np.array([[0.5 + 0.01 * k, 0.0]])  # a fiftieth of its largest step
+        trip.step()
+        assert trip.state.still[0] == 0
+        assert not trip.runs
+
+
+def test_each_environment_stands_still_for_itself() -> None:
+    runner = make_runner(known_line())
+    state = RunnerState.fresh(2, 2, 2)
+    for k in range(2 * STILL_STEPS):
+        points = np.array([[0.0, 0.0], [0.1 * min(k, 9), 0.0]])
+        _, state = runner.act(seen_at(points), np.full((2, 2), [12.0, 0.0]), state)
+        assert state.still[1] == max(k - 9, 0)
+        assert state.still[0] == 0  # where nothing has ever moved nothing is known of what moving is
+    assert state.pace.tolist() == [0.0, pytest.approx(0.1)]
 
 
 def test_a_run_to_an_event_that_is_merged_away_meanwhile_ends_like_others() -> None:
@@ -298,7 +336,7 @@ def test_a_gamble_that_does_not_come_off_is_not_repeated_for_ever() -> None:
 def test_successes_count_in_an_episode_as_failures_do() -> None:
     graph = known_line()
     runner = make_runner(graph)
-    state = RunnerState.fresh(1, 2)
+    state = RunnerState.fresh(1, 2, 2)
     rates = []
     for _ in range(3):
         start = runner.start(state, 0, np.array([8.0, 0.0]))
@@ -329,7 +367,7 @@ def end_runs(runner: Runner, state: RunnerState, ends: list[tuple[str, str, tupl
 def test_runs_of_one_kind_are_counted_and_others_told_apart() -> None:
     runner = make_runner(known_line())
     ends = [("e0", "w1", (0.0, 0.0), 5), ("e0", "w1", (0.0, 0.0), 7), ("e0", "w1", (4.0, 0.0), 3), ("", "w1", (0.0, 0.0), 2)]
-    state = end_runs(runner, RunnerState.fresh(1, 2), ends)
+    state = end_runs(runner, RunnerState.fresh(1, 2, 2), ends)
     assert record(state) == {
         ("e0", "w1", "e0", False): (2.0, 12.0),
         ("e0", "w1", "e1", True): (1.0, 3.0),
@@ -342,7 +380,7 @@ def test_runs_of_one_kind_are_counted_and_others_told_apart() -> None:
 
 def test_a_walk_to_the_goal_is_counted_too() -> None:
     runner = make_runner(known_line())
-    state = end_runs(runner, RunnerState.fresh(1, 2), [("e2", "direct", (0.0, 0.0), 9)] * 3)
+    state = end_runs(runner, RunnerState.fresh(1, 2, 2), [("e2", "direct", (0.0, 0.0), 9)] * 3)
     assert record(state) == {("e2", "direct", "e0", False): (3.0, 27.0)}
     assert [column.tolist() for column in runner.runs(state, 0)] == [[2], [4], [0], [0], [3]]
 
@@ -351,7 +389,7 @@ def test_no_run_is_lost_when_there_are_more_kinds_than_are_told_apart() -> None:
     graph = known_line(24)
     runner = make_runner(graph)
     rng = np.random.default_rng(0)
-    state, total, steps = RunnerState.fresh(1, 2), 0, 0
+    state, total, steps = RunnerState.fresh(1, 2, 2), 0, 0
     for k in range(400):
         source, target = divmod(k, 20)
         at = graph.centers[rng.integers(24)]
@@ -384,7 +422,7 @@ def test_a_state_is_never_changed_in_place() -> None:
 def test_a_new_episode_begins_anew_in_its_environment_only() -> None:
     runner = make_runner(known_line())
     points = np.array([[0.0, 0.0], [4.0, 0.0]])
-    state = RunnerState.fresh(2, 2)
+    state = RunnerState.fresh(2, 2, 2)
     for _ in range(9):
         state, _ = runner.advance(state, points)
         _, state = runner.act(seen_at(points), np.array([[12.0, 0.0], [0.0, 0.0]]), state)
@@ -393,7 +431,7 @@ def test_a_new_episode_begins_anew_in_its_environment_only() -> None:
     assert len(runs) == 2
     anew = state.begun_anew(np.array([True, False]))
     for name, column in anew._asdict().items():
-        np.testing.assert_array_equal(column[0], getattr(RunnerState.fresh(1, 2), name)[0], err_msg=name)
+        np.testing.assert_array_equal(column[0], getattr(RunnerState.fresh(1, 2, 2), name)[0], err_msg=name)
         np.testing.assert_array_equal(column[1], getattr(state, name)[1], err_msg=name)
         assert column.dtype == getattr(state, name).dtype
 
@@ -412,9 +450,9 @@ def test_several_environments_act_as_each_would_alone(seed: int, n_envs: int) ->
     graph = known_line(6)
     points, goals = rng.uniform((-3.0, -2.0), (23.0, 2.0), (2, n_envs, 2))
     slips = rng.normal(0.0, 0.4, (25, n_envs, 2))
-    together = RunnerState.fresh(n_envs, 2)
+    together = RunnerState.fresh(n_envs, 2, 2)
     runner, alone = make_runner(graph), [make_runner(graph) for _ in range(n_envs)]
-    states = [RunnerState.fresh(1, 2) for _ in range(n_envs)]
+    states = [RunnerState.fresh(1, 2, 2) for _ in range(n_envs)]
     for slip in slips:
         together, runs = runner.advance(together, points)
         actions, together = runner.act(seen_at(points), goals, together)

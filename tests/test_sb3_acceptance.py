@@ -432,7 +432,7 @@ def test_what_is_learned_is_no_secret(trained: SkillGraphAgent) -> None:
         assert option.contains(event.center[None]).all()
     assert set(trained.graph.nx.nodes) == {*ids, *(option.id for option in trained.options)}
     for source, target, attributes in trained.graph.nx.edges(data=True):
-        record = {"forward", "backward", "crossing_steps", "successes", "success_steps", "failures"}
+        record = {"forward", "backward", "crossing_steps", "successes", "success_steps", "failures", "failure_steps"}
         assert set(attributes) == (record if source in ids else {"rate"})
         assert (source in ids) != (target in ids)
         assert all(value >= 0.0 for value in attributes.values())

@@ -112,7 +112,7 @@ def test_no_event_lies_in_the_pit_and_runs_into_it_land_nowhere(monkeypatch: pyt
 @pytest.mark.parametrize("option", ["w1", DIRECT])
 def test_being_stuck_ends_an_option_as_failed_even_where_it_leads(trained: SkillGraphAgent, option: str) -> None:
     goal = trained.events[1].center
-    running = RunnerState.fresh(1, 2)._replace(
+    running = RunnerState.fresh(1, 2, 2)._replace(
         option=np.array([option]), began=np.array(["e0"]), aim=goal[None], steps=np.full(1, 3), timeout=np.full(1, 50)
     )
     for point in (goal[None] + 0.7, goal[None]):

@@ -11,7 +11,7 @@ from sb3_skillgraph.choices import EXPECTED, ChoiceModel
 from sb3_skillgraph.graph import MAX_DEGREE, SkillGraph
 from sb3_skillgraph.learning.witness import FIT_EVERY, Witness
 from sb3_skillgraph.runner import Run
-from sb3_skillgraph.walk_model import FIRST_GUESS, HASTY_LOSS, WalkModel
+from sb3_skillgraph.walk_model import FIRST_GUESS, HASTY_LOSS, WalkModel, timeout
 
 every_time = settings(derandomize=True, deadline=None, max_examples=30, database=None)
 
@@ -237,9 +237,30 @@ def test_a_run_of_a_walk_is_recorded_on_its_edge() -> None:
     witness.ended(run("e0", "w1", False, landing="e2", steps=23))
     edges = witness.graph.edges
     row = edges.find(0, 1)
+    assert edges.failure_steps[row] == 23.0
     assert (edges.successes[row], edges.success_steps[row], edges.failures[row]) == (1.0, 5.0, 1.0)
     assert edges.landing[row][edges.landing_weight[row] > 0].tolist() == [2]
     assert (edges.successes.sum(), edges.failures.sum()) == (1.0, 1.0)
+
+
+def test_it_is_learned_how_long_failed_runs_take() -> None:
+    expected = []
+    for steps in (10, 40):
+        witness = make_witness()
+        walk(witness, [*straight(6.0), 8.0])
+        for _ in range(200):
+            witness.ended(run("e0", "w1", True, landing="e1", steps=5))
+            witness.ended(run("e0", "w1", False, landing="e0", steps=steps))
+        witness.fit()
+        model, walks = witness.choice_model.model, witness.choice_model.walks()
+        row = witness.graph.edges.find(0, 1)
+        assert walks.failed_steps[row] == pytest.approx(steps, rel=0.02)
+        # Walks that were not tried take the same share of the time that they have.
+        assert model.patience == pytest.approx(steps / timeout(walks.steps[row]), rel=0.05)
+        other = int(np.flatnonzero(witness.graph.edges.failures == 0)[0])
+        assert walks.failed_steps[other] > 0.0
+        expected.append(witness.choice_model.walks().failed_steps[other])
+    assert expected[0] < expected[1]
 
 
 @pytest.mark.parametrize(
@@ -337,7 +358,7 @@ def test_the_model_is_fitted_every_so_many_steps() -> None:
         witness.step(0, np.zeros(2))
     assert model.version == 0
     witness.step(0, np.zeros(2))
-    assert model.version == 1
+    assert model.version == 2
 
 
 def test_what_has_aged_teaches_less() -> None:

@@ -109,6 +109,8 @@ class Missions:
         was_exploring = mission.exploring
         if run is not None:
             mission.n_failures += not run.success
+            if mission.exploring and not run.success and run.steps < self.exploration_steps:
+                mission.beyond = None  # who cannot get on towards the point walks at random
         over = self._over(mission, point)
         if over or done:
             self.current[env] = None

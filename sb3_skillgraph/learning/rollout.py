@@ -72,7 +72,7 @@ class Rollout:
     def _forget(self) -> None:
         """Forget what the environments were in the middle of."""
         n_envs, graph = self.store.n_envs, self.runner.graph
-        self.state = RunnerState.fresh(n_envs, graph.goal_dim)
+        self.state = RunnerState.fresh(n_envs, graph.goal_dim, self.store.observation_dim)
         self.held = np.zeros((n_envs, self.store.action_dim), dtype=np.float32)
         self.hold_left = np.zeros(n_envs, dtype=np.int64)
         self.pending = None
@@ -119,7 +119,7 @@ class Rollout:
             state.option[i] = DIRECT
             state.began[i] = state.arrived[i]
             state.aim[i] = mission.goal if mission.beyond is None else mission.beyond
-            state.steps[i], state.timeout[i] = 0, mission.explore_steps
+            state.steps[i], state.timeout[i], state.still[i] = 0, mission.explore_steps, 0
         return state
 
     def with_noise(

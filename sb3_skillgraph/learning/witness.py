@@ -9,7 +9,7 @@ from sb3_skillgraph.edges import NOWHERE
 from sb3_skillgraph.graph import SkillGraph
 from sb3_skillgraph.planning import DIRECT
 from sb3_skillgraph.runner import Run
-from sb3_skillgraph.walk_model import HASTY_LOSS, Kind
+from sb3_skillgraph.walk_model import HASTY_LOSS, Kind, timeout
 
 #: Environment steps between two fits of the model of untried walks.
 FIT_EVERY = 1_000
@@ -177,15 +177,21 @@ class Witness:
             np.concatenate([edges.failures * aging, 1.0 - success]),
             np.concatenate([edges.success_steps * aging, success * steps]),
         )
-        self._learn_loss(kinds)
+        model.fit_failures(self._loss(kinds), *self._patience())
 
-    def _learn_loss(self, kinds: Kind) -> None:
-        """Learn which share of failures lands far away, for hasty walks and for others."""
+    def _loss(self, kinds: Kind) -> np.ndarray:
+        """Return which share of failures lands far away, for hasty walks and for others."""
         graph, model = self.graph, self.choice_model.model
         hasty = model.is_hasty(kinds)
         failures, far = graph.edges.failures * graph.aging(), self.choice_model.far_failures(kinds)
-        for i, (rows, guess) in enumerate(((hasty, HASTY_LOSS), (~hasty, 0.0))):
-            model.loss[i] = (far[rows].sum() + FAR_PRIOR * guess) / (failures[rows].sum() + FAR_PRIOR)
+        kinds_of_walks = ((hasty, HASTY_LOSS), (~hasty, 0.0))
+        return np.array([(far[i].sum() + FAR_PRIOR * guess) / (failures[i].sum() + FAR_PRIOR) for i, guess in kinds_of_walks])
+
+    def _patience(self) -> tuple[float, float]:
+        """Return the steps that failed runs took, and those that they might have taken."""
+        edges, aging = self.graph.edges, self.graph.aging()
+        allowed = edges.failures * timeout(self.choice_model.walks().steps)
+        return float((edges.failure_steps * aging).sum()), float((allowed * aging).sum())
 
     # -- saving -------------------------------------------------------------------------------------------------------
 

@@ -24,7 +24,7 @@ class TransitionStore:
     def __init__(self, capacity: int, observation_dim: int, goal_dim: int, action_dim: int, n_envs: int = 1) -> None:
         self.capacity = max(capacity // n_envs, 1) * n_envs
         self.n_envs = n_envs
-        self.action_dim = action_dim
+        self.observation_dim, self.action_dim = observation_dim, action_dim
         self.total = 0
         ends = np.cumsum([observation_dim, goal_dim, observation_dim, goal_dim, action_dim, goal_dim]).tolist()
         self._slices = {name: slice(start, end) for name, start, end in zip(_COLUMNS, [0, *ends], ends, strict=False)}
@@ -33,9 +33,10 @@ class TransitionStore:
         self._terminated = np.zeros(self.capacity, dtype=bool)
         self._stuck = np.zeros(self.capacity, dtype=bool)
         self._trajectory = np.zeros(self.capacity, dtype=np.int64)
-        self._current = np.arange(n_envs, dtype=np.int64)
-        self._n_trajectories = n_envs
+        self._current = np.zeros(n_envs, dtype=np.int64)
+        self._n_trajectories = 0
         self._last_row = np.full(1024, -1, dtype=np.int64)  # of each trajectory
+        self.cut()
 
     def __len__(self) -> int:
         return min(self.total, self.capacity)
@@ -78,15 +79,18 @@ class TransitionStore:
         self._stuck[block] = False if stuck is None else stuck
         self._trajectory[block] = self._current
         rows = np.arange(self.total, self.total + self.n_envs)
-        while self._n_trajectories > len(self._last_row):
-            self._last_row = np.concatenate([self._last_row, np.full_like(self._last_row, -1)])
         self._last_row[self._current] = rows
         if done.any():
-            n_done = int(np.count_nonzero(done))
-            self._current[done] = np.arange(self._n_trajectories, self._n_trajectories + n_done)
-            self._n_trajectories += n_done
+            self._begin_trajectories(done)
         self.total += self.n_envs
         return rows
+
+    def _begin_trajectories(self, where: np.ndarray) -> None:
+        """Let other trajectories begin in some environments, bool array of shape ``(n_envs,)``."""
+        before, self._n_trajectories = self._n_trajectories, self._n_trajectories + int(np.count_nonzero(where))
+        self._current[where] = np.arange(before, self._n_trajectories)
+        while self._n_trajectories > len(self._last_row):
+            self._last_row = np.concatenate([self._last_row, np.full_like(self._last_row, -1)])
 
     def column(self, name: str, rows: np.ndarray) -> np.ndarray:
         """Read one column.
@@ -126,8 +130,7 @@ class TransitionStore:
 
     def cut(self) -> None:
         """End every running trajectory: what is written next does not follow from what was written last."""
-        self._current = np.arange(self._n_trajectories, self._n_trajectories + self.n_envs, dtype=np.int64)
-        self._n_trajectories += self.n_envs
+        self._begin_trajectories(np.ones(self.n_envs, dtype=bool))
 
     def future(self, rows: np.ndarray, horizon: int, rng: np.random.Generator) -> np.ndarray:
         """Draw, for each row, a row on the same trajectory that is not earlier.
@@ -190,8 +193,6 @@ class TransitionStore:
         self._current = np.array(state["current"])
         self._n_trajectories = int(state["n_trajectories"])
         self._last_row = np.array(state["last_row"])
-        if len(self._last_row) == 0:
-            self._last_row = np.full(1024, -1, dtype=np.int64)
 
     def _check_rows(self, state: dict[str, Any]) -> None:
         """Refuse rows and counters that do not belong together."""
@@ -206,7 +207,7 @@ class TransitionStore:
         if any(len(state["columns"][name]) != n for name in _COLUMNS):
             raise ValueError(f"The columns of the stored replay buffer have not {n} rows each.")
         last = np.asarray(state["last_row"])
-        if last.ndim != 1 or last.dtype.kind != "i" or len(last) > n_trajectories:
+        if last.ndim != 1 or last.dtype.kind != "i" or len(last) != n_trajectories or not len(last):
             raise ValueError(f"The stored replay buffer has no last rows of {n_trajectories} trajectories.")
         numbers = np.concatenate([state["trajectory"], state["current"]])
         if n and not (numbers.min() >= 0 and np.asarray(state["trajectory"]).max() < len(last) and last.max() < total):
