@@ -28,7 +28,7 @@ from sb3_skillgraph import __version__
 from sb3_skillgraph.baselines import StraightOn, random_walk
 from sb3_skillgraph.envs import MazeGeometry
 from sb3_skillgraph.evaluation import Predictor, run_pair, sample_pairs
-from sb3_skillgraph.run_folder import CONFIG, checkpoints, load_agent
+from sb3_skillgraph.experiments.run_folder import CONFIG, checkpoints, load_agent
 
 TOLERANCES = {"0.45 m": 0.45, "0.6 m": 0.6, "0.6 cells": 2.4}
 WALKS = ("pairs", "far", "floor", "straight")

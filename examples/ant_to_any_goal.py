@@ -18,8 +18,8 @@ import torch as th
 from PIL import Image
 
 from sb3_skillgraph import SkillGraphAgent
-from sb3_skillgraph.console import assignment
 from sb3_skillgraph.envs.mujoco_mazes import MujocoMazeTask
+from sb3_skillgraph.experiments.console import assignment
 from sb3_skillgraph.plotting import Trajectory, plot_plan, save_figure
 
 EVERY = 4  # steps of 0.1 s between two frames

@@ -17,13 +17,13 @@ from rich.table import Table
 import sb3_skillgraph.envs  # noqa: F401 - registers the environments
 from sb3_skillgraph.agent import SkillGraphAgent
 from sb3_skillgraph.baselines import RandomWalk, StraightOn
-from sb3_skillgraph.console import UserError, assignment, for_people, positive
 from sb3_skillgraph.evaluation import NoPairsError, PairsResult, Predictor, evaluate_pairs
 from sb3_skillgraph.experiments.commands import add_compare, add_figure, add_status
+from sb3_skillgraph.experiments.console import UserError, assignment, for_people, positive
+from sb3_skillgraph.experiments.run_folder import AGENT, EXPERIENCE, is_unfinished
+from sb3_skillgraph.experiments.training import train, write_json
 from sb3_skillgraph.hyperparams import check_hyperparams, did_you_mean, load_hyperparams
 from sb3_skillgraph.plotting import plot_plan, plot_skill_graph, run_plan, save_figure
-from sb3_skillgraph.run_folder import AGENT, EXPERIENCE, is_unfinished
-from sb3_skillgraph.training import train, write_json
 
 DEMO_ENV, DEMO_STEPS, DEMO_PAIRS = "SkillGraph/PointMazeMedium-v0", 20_000, 100
 USER_ERROR, INTERRUPTED = 2, 130

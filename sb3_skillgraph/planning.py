@@ -20,8 +20,8 @@ LOST_HORIZONS = 10.0
 PRECISION, MAX_SWEEPS = 0.5, 300
 #: Bins of time in which the success within the horizon is worked out.
 TIME_BINS = 200
-#: Share of the failures that will happen again and again, of an option that always fails: what a policy without noise cannot do
-#: from some place it never can. Of one that seldom fails it is less, in proportion.
+#: Share of the failures that will happen again and again, of an option that always fails: what a policy without noise cannot
+#: do from some place it never can. Of one that seldom fails it is less, in proportion.
 FOR_GOOD = 0.06
 #: Probability that a plan promises at least: nothing is impossible.
 LEAST = 1e-6

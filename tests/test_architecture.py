@@ -18,7 +18,6 @@ FLOORS: dict[str, float] = {
     "vec_env": 0,
     "events": 0,
     "saving": 0.5,  # writes the version
-    "console": 0.5,
     "envs": 1,
     "memory": 2,
     "options": 3,  # initiation sets, policies, termination sets
@@ -37,11 +36,9 @@ FLOORS: dict[str, float] = {
     "smdp": 11,  # on options, not on the agent
     "callbacks": 12,
     "hyperparams": 12,
-    "run_folder": 12,
     "evaluation": 12,
     "baselines": 13,
     "plotting": 13,
-    "training": 13,
     "experiments": 14,
     "cli": 15,
     "__init__": 16,

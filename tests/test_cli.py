@@ -11,14 +11,15 @@ import pytest
 import yaml
 from conftest import TOY, differences, state_of, without_clock
 
-from sb3_skillgraph import SkillGraphAgent, cli, training
+from sb3_skillgraph import SkillGraphAgent, cli
 from sb3_skillgraph.baselines import StraightOn
 from sb3_skillgraph.callbacks import SkillGraphProgressBarCallback
 from sb3_skillgraph.envs import _TASKS
 from sb3_skillgraph.evaluation import evaluate_pairs
+from sb3_skillgraph.experiments import training
+from sb3_skillgraph.experiments.run_folder import checkpoints, read_progress
 from sb3_skillgraph.hyperparams import FILE, load_hyperparams
 from sb3_skillgraph.options.learner import OptionTD3
-from sb3_skillgraph.run_folder import checkpoints, read_progress
 
 Capture = pytest.CaptureFixture[str]
 PICTURES = {"skill_graph.png", "plan.png"}

@@ -25,8 +25,8 @@ from imageio.v3 import imread
 from sb3_skillgraph.cli import main
 from sb3_skillgraph.experiments import RunSpec, compare, figures, learners, load_plan, run, runner, status
 from sb3_skillgraph.experiments.figures import method_curves, practice_curves
+from sb3_skillgraph.experiments.run_folder import checkpoints, read_progress
 from sb3_skillgraph.experiments.summary import estimate, interquartile_mean
-from sb3_skillgraph.run_folder import checkpoints, read_progress
 from sb3_skillgraph.smdp import SMDPQLearning
 
 SMALL_NETS = {

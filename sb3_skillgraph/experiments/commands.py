@@ -10,7 +10,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from sb3_skillgraph.console import UserError, for_people, positive
+from sb3_skillgraph.experiments.console import UserError, for_people, positive
 from sb3_skillgraph.experiments.figures import redraw
 from sb3_skillgraph.experiments.plan import RunSpec, load_plan
 from sb3_skillgraph.experiments.runner import ERROR, RunStatus, by_method, compare, status

@@ -13,11 +13,11 @@ from sb3_skillgraph.agent import SkillGraphAgent
 from sb3_skillgraph.baselines import random_walk
 from sb3_skillgraph.envs import MazeGeometry
 from sb3_skillgraph.experiments.plan import RunSpec
+from sb3_skillgraph.experiments.run_folder import STEPS, checkpoints, load_agent, read_progress
 from sb3_skillgraph.experiments.runner import DONE, STRETCH, is_done
 from sb3_skillgraph.experiments.summary import estimate
 from sb3_skillgraph.learning.dco import learn_fiedler
 from sb3_skillgraph.plotting import paper_figures as draw
-from sb3_skillgraph.run_folder import STEPS, checkpoints, load_agent, read_progress
 
 SHARES = (0.1, 0.3, 0.6, 1.0)  # of the run, at which it is looked at
 N_PAIRS = 20_000

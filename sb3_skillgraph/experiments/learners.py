@@ -26,10 +26,10 @@ from sb3_skillgraph.baselines import (
     make_uvfa,
 )
 from sb3_skillgraph.evaluation import Predictor
+from sb3_skillgraph.experiments.run_folder import AGENT, load_agent, save_agent, stops
 from sb3_skillgraph.hyperparams import check_hyperparams, did_you_mean, load_hyperparams
 from sb3_skillgraph.options.learner import OptionDDPG, OptionTD3
 from sb3_skillgraph.plotting import event_links, near_links
-from sb3_skillgraph.run_folder import AGENT, load_agent, save_agent, stops
 
 Check = Callable[[int], None]
 GOAL_STEPS = 200  # for which the recipe pursues a goal, as long as an option may run

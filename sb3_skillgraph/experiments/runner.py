@@ -19,11 +19,11 @@ import torch as th
 from filelock import FileLock, Timeout
 from joblib import Parallel, delayed, parallel_config
 
-from sb3_skillgraph.console import versions
 from sb3_skillgraph.evaluation import PairsResult, evaluate_pairs, run_pair
+from sb3_skillgraph.experiments.console import versions
 from sb3_skillgraph.experiments.learners import ALGORITHMS, Learner
 from sb3_skillgraph.experiments.plan import RunSpec
-from sb3_skillgraph.run_folder import CONFIG, PROGRESS, STEPS, checkpoints, read_progress, take_checkpoint
+from sb3_skillgraph.experiments.run_folder import CONFIG, PROGRESS, STEPS, checkpoints, read_progress, take_checkpoint
 
 DONE, ERROR, LOCK = "done.json", "error.txt", "lock"
 SECONDS = "time/seconds"

@@ -11,8 +11,8 @@ from stable_baselines3.common.logger import HumanOutputFormat, Logger, configure
 
 from sb3_skillgraph.agent import SkillGraphAgent
 from sb3_skillgraph.callbacks import SkillGraphProgressBarCallback
-from sb3_skillgraph.console import UserError, for_people, versions
-from sb3_skillgraph.run_folder import (
+from sb3_skillgraph.experiments.console import UserError, for_people, versions
+from sb3_skillgraph.experiments.run_folder import (
     AGENT,
     CONFIG,
     PROGRESS,
