@@ -6,7 +6,6 @@ from typing import Any, NamedTuple, Protocol
 
 import gymnasium as gym
 import numpy as np
-from scipy.stats import binomtest
 
 from sb3_skillgraph.agent import SkillGraphAgent
 from sb3_skillgraph.envs import MazeGeometry
@@ -105,6 +104,8 @@ class PairsResult:
     @property
     def interval(self) -> tuple[float, float]:
         """95 % confidence interval of the success rate (Wilson)."""
+        from scipy.stats import binomtest  # when it is used: it takes half a second to import
+
         n_successes = sum(pair.success for pair in self.pairs)
         interval = binomtest(n_successes, len(self.pairs)).proportion_ci(0.95, method="wilson")
         return float(interval.low), float(interval.high)

@@ -1,12 +1,14 @@
 """The skill graph: events, the options that lead from one to another, and the record of their runs (section 3.1)."""
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import networkx
 import numpy as np
 
 from sb3_skillgraph.edges import NOWHERE, RECORD, Edges, land
 from sb3_skillgraph.events import Event
+
+if TYPE_CHECKING:
+    import networkx
 
 #: Landmarks lie at least so many event radii apart: 1.5 to 3 make the same agent, fewer make plans cheaper.
 SPACING = 1.5
@@ -49,7 +51,7 @@ class SkillGraph:
         self.walk_ids: list[str] = []  # of the walks to the events, in their order
         self._index: dict[str, int] = {}  # of events, by their ids and by those of the walks to them
         self._n_made = 0
-        self._nx: tuple[int, networkx.DiGraph] = (-1, networkx.DiGraph())
+        self._nx: tuple[int, networkx.DiGraph] | None = None
 
     def __repr__(self) -> str:
         return f"<SkillGraph of {len(self.events)} events and {self.edges.size} edges>"
@@ -245,17 +247,19 @@ class SkillGraph:
     # -- looking at it ------------------------------------------------------------------------------------------------
 
     @property
-    def nx(self) -> networkx.DiGraph:
+    def nx(self) -> "networkx.DiGraph":
         """The graph as networkx has it, numbers and strings only: a copy to look at, made when asked for.
 
         Edges from an event to a walk carry the record of the walk's runs from there; edges from a walk to an event the
         share of its runs that landed there, wherever they began.
         """
-        if self._nx[0] != self.version:
+        if self._nx is None or self._nx[0] != self.version:
             self._nx = (self.version, self._build_nx())
         return self._nx[1]
 
-    def _build_nx(self) -> networkx.DiGraph:
+    def _build_nx(self) -> "networkx.DiGraph":
+        import networkx  # when it is used: it takes a while to import
+
         graph, edges = networkx.DiGraph(), self.edges
         for i, event in enumerate(self.events):
             place = {f"x{k}": float(x) for k, x in enumerate(event.center)}

@@ -1,14 +1,16 @@
 """Plans: the way to a goal that costs the fewest environment steps, by what options have done (sections 3.2.4, 3.3)."""
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from scipy.sparse import csr_array
 
 from sb3_skillgraph.choices import EXPECTED, NO_RUNS, PESSIMISTIC, ChoiceModel, Choices, Runs, Start
 from sb3_skillgraph.edges import NOWHERE
 from sb3_skillgraph.graph import SkillGraph
 from sb3_skillgraph.walk_model import WalkModel
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
 
 #: Id of the option that walks to the goal itself.
 DIRECT = "direct"
@@ -38,7 +40,7 @@ class Linear(NamedTuple):
     """
 
     constant: np.ndarray
-    matrix: csr_array
+    matrix: "csr_array"
 
     @classmethod
     def of(cls, choices: Choices, stance: float, n_vertices: int) -> "Linear":
@@ -50,6 +52,8 @@ class Linear(NamedTuple):
         :param stance: what to count on, in standard deviations above what is expected
         :param n_vertices: number of all vertices
         """
+        from scipy.sparse import csr_array  # when it is used: it takes a while to import
+
         success = choices.success(stance)
         failure = 1.0 - success
         landing, share = choices.landings()

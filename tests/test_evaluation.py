@@ -329,7 +329,7 @@ def test_no_plan_for_what_is_no_goal(trained: SkillGraphAgent, goal: Any) -> Non
 # -- adapt ------------------------------------------------------------------------------------------------------------
 
 
-def test_adapt_pursues_the_goal_and_nothing_else(trained: SkillGraphAgent) -> None:
+def test_adapt_pursues_the_goal_and_comes_back_to_it(trained: SkillGraphAgent) -> None:
     goal = max((event.center for event in trained.events), key=lambda c: float(np.linalg.norm(c - trained.events[0].center)))
     goal, n_steps = goal + 0.1, trained.num_timesteps
     pursued: list[np.ndarray] = []
@@ -341,7 +341,11 @@ def test_adapt_pursues_the_goal_and_nothing_else(trained: SkillGraphAgent) -> No
     trained.adapt(goal, total_timesteps=120, callback=note)
     assert trained.num_timesteps == n_steps + 120
     assert len(pursued) > 60
-    np.testing.assert_allclose(pursued, np.tile(goal, (len(pursued), 1)), atol=1e-6)
+    to_goal = np.array([np.allclose(one, goal, atol=1e-6) for one in pursued])
+    assert to_goal[0] and to_goal.mean() > 0.3
+    # Whoever is there goes to another event, to come back.
+    centers = trained.graph.centers
+    assert all(np.linalg.norm(centers - one, axis=1).min() < 1e-6 for one in np.array(pursued)[~to_goal])
     assert trained.parts.missions.pinned is None
     pursued.clear()
     trained.learn(200, callback=note, reset_num_timesteps=False)

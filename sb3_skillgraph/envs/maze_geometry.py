@@ -5,7 +5,6 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.sparse.csgraph import shortest_path
 
 MazeMap = Sequence[Sequence[int | str]]
 
@@ -241,6 +240,8 @@ class _CornerGraph:
         self._low = np.concatenate([box.min(axis=1) - by for box, by in grown])
         self._high = np.concatenate([box.max(axis=1) + by for box, by in grown])
         lengths = np.array([self._visible_distances(corner) for corner in self._corners]).reshape(2 * (len(corners),))
+        from scipy.sparse.csgraph import shortest_path  # when it is used: it takes a while to import
+
         self._between = shortest_path(np.where(np.isfinite(lengths), lengths, 0.0), directed=False)
 
     def _to_xy(self, column_row: NDArray[np.int64]) -> NDArray[np.float64]:

@@ -7,8 +7,6 @@ from collections import deque
 from typing import Any, NamedTuple
 
 import numpy as np
-import sklearn
-from sklearn.svm import SVC, OneClassSVM
 
 # Successes cover an option's region densely, so few trajectories with few points each describe it well.
 N_SUCCESSES, POINTS_PER_SUCCESS, N_FAILURES = 40, 12, 30
@@ -116,12 +114,16 @@ class InitiationSet:
         if not known or not self._n_news or not (force or self._n_news * 5 >= known):
             return False
         self._n_news = 0
+        import sklearn  # when it is used: it takes a second to import
+
         # What scikit-learn would check takes it longer than the fit.
         with sklearn.config_context(assume_finite=True, skip_parameter_validation=True):
             self._fit()
         return True
 
     def _fit(self) -> None:
+        from sklearn.svm import SVC
+
         positives = np.concatenate([*self.successes, *self.regions.values()])
         negatives = self._standing_failures()
         # A floor under the kernel's width: a handful of points in one spot still describe a place, not a point.
@@ -198,6 +200,8 @@ class InitiationSet:
 
 
 def _one_class(points: np.ndarray, nu: float, gamma: float) -> Boundary:
+    from sklearn.svm import OneClassSVM
+
     machine = OneClassSVM(kernel="rbf", nu=nu, gamma=gamma).fit(points)
     # A hair of slack: libsvm leaves its own margin vectors a rounding error outside.
     return Boundary(machine.support_vectors_, machine.dual_coef_[0], float(machine.intercept_[0]) + 1e-3, gamma)
