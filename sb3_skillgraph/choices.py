@@ -212,17 +212,18 @@ class ChoiceModel:
 
     # -- what an episode adds -----------------------------------------------------------------------------------------
 
-    def of_episode(self, start: Start, goal: np.ndarray, runs: Runs) -> tuple[np.ndarray, Choices]:
+    def of_episode(self, start: Start, goal: np.ndarray, runs: Runs, everywhere: bool = False) -> tuple[np.ndarray, Choices]:
         """Return what can be done beside what training has shown.
 
         :param start: where the agent stands
         :param goal: shape ``(goal_dim,)``
         :param runs: what has happened in this episode
+        :param everywhere: whether walks straight to the goal are considered from all events, however far away
         :return: edges that the episode has shown more of, and the choices that take their place or come on top: those, the
             walks to the goal, and last what can be done at the start
         """
         replaced, tried = self._tried(runs)
-        to_goal = self._to_goal(replaced, tried, goal, runs)
+        to_goal = self._to_goal(replaced, tried, goal, runs, everywhere)
         return replaced, Choices.join([tried, to_goal, self._at_start(replaced, tried, to_goal, start, goal, runs)])
 
     def _tried(self, runs: Runs) -> tuple[np.ndarray, Choices]:
@@ -240,7 +241,7 @@ class ChoiceModel:
         rows = np.flatnonzero(chosen)
         return Choices.join([self.walks().take(rows[~np.isin(rows, replaced)]), tried.take(chosen[replaced])])
 
-    def _to_goal(self, replaced: np.ndarray, tried: Choices, goal: np.ndarray, runs: Runs) -> Choices:
+    def _to_goal(self, replaced: np.ndarray, tried: Choices, goal: np.ndarray, runs: Runs, everywhere: bool) -> Choices:
         """Return the walks to the goal itself, from events.
 
         Where the goal belongs to an event, whoever can walk to that can walk to the goal as well. From there itself, and from
@@ -250,13 +251,17 @@ class ChoiceModel:
         graph, vertex = self.graph, len(self.graph.events)
         distance = graph.distances(goal)
         home = graph.locate(goal)
-        near = np.argsort(distance, kind="stable")[:NEAR_EVENTS]
+        near = np.argsort(distance, kind="stable")
+        if not everywhere:
+            near = near[:NEAR_EVENTS]
         if home == NOWHERE:
-            return self._short(self._guessed(near, near, vertex, distance[near], np.zeros(len(near)), runs))
+            guessed = self._guessed(near, near, vertex, distance[near], np.zeros(len(near)), runs)
+            return guessed if everywhere else self._short(guessed)
         beside = self._beside(self._edges(graph.edges.target == home, replaced, tried), home, distance, runs)
         near = near[~np.isin(near, beside.source)]
         seen = (near == home).astype(np.float64)  # somebody was near the goal, in its event
-        return self._short(Choices.join([self._guessed(near, near, vertex, distance[near], seen, runs), beside]))
+        found = Choices.join([self._guessed(near, near, vertex, distance[near], seen, runs), beside])
+        return found if everywhere else self._short(found)
 
     def _short(self, choices: Choices) -> Choices:
         """Return those that are no longer than the walks of the graph; the shortest where there is none."""

@@ -168,7 +168,14 @@ class Planner:
         """What it costs to be lost, in environment steps."""
         return LOST_HORIZONS * self.horizon
 
-    def solve(self, start: Start, goal: np.ndarray, runs: Runs = NO_RUNS, stance: float = PESSIMISTIC) -> Solution:
+    def solve(
+        self,
+        start: Start,
+        goal: np.ndarray,
+        runs: Runs = NO_RUNS,
+        stance: float = PESSIMISTIC,
+        everywhere: bool = False,
+    ) -> Solution:
         """Work out what it costs to get to a goal, by value iteration.
 
         It begins from above: everything is lost, but for the goal; what a sweep finds is a way that can be gone. The
@@ -179,11 +186,12 @@ class Planner:
         :param goal: shape ``(goal_dim,)``
         :param runs: what has happened in this episode
         :param stance: what to count on, in standard deviations above what is expected
+        :param everywhere: whether walks straight to the goal are considered from all events, however far away
         """
         n_events = len(self.graph.events)
         n_vertices = n_events + 3
         known, walks = self._worked_out(stance), self.choice_model.walks()
-        replaced, episode = self.choice_model.of_episode(start, goal, runs)
+        replaced, episode = self.choice_model.of_episode(start, goal, runs, everywhere)
         constant = known.linear.constant
         if len(replaced):
             constant = np.where(np.isin(known.order, replaced), np.inf, constant)

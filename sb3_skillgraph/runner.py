@@ -229,11 +229,16 @@ class Runner:
         return Start(point.astype(np.float64), graph.locate(point) if event == NOWHERE else event)
 
     def decide(self, state: RunnerState, i: int, start: Start, goal: np.ndarray, stance: float) -> Solution:
-        """Plan for one environment; where everything seems lost, count on more: then a gamble is better than nothing."""
+        """Plan for one environment.
+
+        Where everything seems lost, count on more: then a gamble is better than nothing; and where no way is known at all, get
+        to where it is worth most to walk straight on.
+        """
         runs = self.runs(state, i)
-        for counted_on in (stance, EXPECTED, OPTIMISTIC):
-            solution = self.planner.solve(start, goal.astype(np.float64), runs, counted_on)
-            if counted_on >= OPTIMISTIC or solution.values[solution.start] < self.planner.lost:
+        stances = [stance, *(more for more in (EXPECTED, OPTIMISTIC) if more > stance)]
+        for counted_on, everywhere in (*((each, False) for each in stances), (OPTIMISTIC, True)):
+            solution = self.planner.solve(start, goal.astype(np.float64), runs, counted_on, everywhere)
+            if solution.values[solution.start] < self.planner.lost:
                 break
         return solution
 

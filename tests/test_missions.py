@@ -204,12 +204,12 @@ def test_a_way_is_looked_for_to_a_goal_where_nobody_has_been() -> None:
     missions.pinned = np.array([12.0, 3.0])
     found = drawn(missions, 200)
     looking = [mission for mission in found if mission.goal.tolist() != [12.0, 3.0]]
-    assert 60 < len(looking) < 140
+    assert 130 < len(looking) < 185
     assert all(mission.explore_steps == EXPLORATION for mission in looking)
     assert {mission.beyond is None for mission in looking} == {True, False}
     # Half of them set out from the nearest event, and of the others some: the way may begin elsewhere.
     nearest = [mission for mission in looking if mission.goal.tolist() == [8.0, 0.0]]
-    assert 0.5 < len(nearest) / len(looking) < 0.95
+    assert 0.2 < len(nearest) / len(looking) < 0.8
     assert {tuple(mission.goal) for mission in looking} == {tuple(center) for center in missions.graph.centers}
 
 

@@ -86,7 +86,7 @@ class GivenChoices(ChoiceModel):
     def walks(self) -> Choices:
         return self.between
 
-    def of_episode(self, start: Start, goal: np.ndarray, runs: Runs) -> tuple[np.ndarray, Choices]:
+    def of_episode(self, start: Start, goal: np.ndarray, runs: Runs, everywhere: bool = False) -> tuple[np.ndarray, Choices]:
         return np.zeros(0, dtype=np.int64), self.others
 
 

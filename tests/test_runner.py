@@ -206,9 +206,7 @@ def test_a_run_may_take_the_time_that_its_expected_steps_allow() -> None:
 
 
 def test_who_stands_still_has_failed_long_before_the_time_is_up() -> None:
-    graph = line_graph(4)
-    tried(graph, 0, 1, 20)
-    trip = Trip(make_runner(graph), (0.0, 0.0), (12.0, 0.0), wall_at(2.0))
+    trip = Trip(make_runner(known_line()), (0.0, 0.0), (12.0, 0.0), wall_at(2.0))
     while not trip.runs:
         trip.step()
     (run,) = trip.runs
@@ -306,6 +304,23 @@ def test_a_walk_that_keeps_failing_in_an_episode_gives_way_to_another() -> None:
     kept = record(trip.state)
     assert sum(count for count, _ in kept.values()) == len(trip.runs)
     assert kept["e0", "w1", failures[0].landing, False][0] >= 1.0
+
+
+def test_where_no_way_is_known_it_goes_where_it_is_worth_most_to_walk_straight_on() -> None:
+    graph = known_line(8)
+    for place in ((30.0, 2.0), (34.0, 2.0)):  # an island, with the goal
+        graph.add_event(np.array(place), salient=False)
+    tried(graph, 8, 9, 20)
+    model = WalkModel()
+    model.intercept, model.coefficients[5:] = 3.0, (0.0, -2.0)  # of walks that nobody was seen to do, long ones seldom succeed
+    runner = Runner(graph, Planner(graph, model, HORIZON), Straight(), way_to_aim)  # type: ignore[arg-type]
+    trip = Trip(runner, (0.0, 0.0), (34.0, 2.0))
+    trip.step()
+    assert trip.options == ["w1"]
+    trip.go(HORIZON)
+    assert trip.arrived()
+    (last,) = [run for run in trip.runs if run.option == "direct"] or [trip.runs[-1]]
+    assert last.event in ("e6", "e7")
 
 
 def test_a_gamble_that_does_not_come_off_is_not_repeated_for_ever() -> None:

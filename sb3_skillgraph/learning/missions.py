@@ -21,7 +21,9 @@ N_PROPOSALS = 3
 TOWARDS = 0.5
 #: Share of the missions that look for a way to a goal which adaptation is for, while nobody has been there; of those the
 #: share that sets out from the event nearest to it: what lies nearest may be the far side of a wall.
-LOOK_FOR_A_WAY, FROM_NEAREST = 0.5, 0.5
+LOOK_FOR_A_WAY, FROM_NEAREST = 0.8, 0.3
+#: Points that are proposed until one lies where nobody has been.
+MOST_PROPOSALS = 20
 #: Share of the missions without noise: noise makes its own luck, and only runs without it go into records.
 CLEAN = 0.5
 
@@ -140,7 +142,7 @@ class Missions:
         if self.pinned is not None:
             return self._adapt(point, self.pinned)
         if self.rng.random() < EXPLORE:
-            return self._explore(point, self.salience)
+            return self._explore(point)
         return self._travel()
 
     def _travel(self) -> Mission:
@@ -150,12 +152,12 @@ class Missions:
     def _random_walk(self, point: np.ndarray) -> Mission:
         return Mission(point.astype(np.float64), explore_steps=self.exploration_steps, exploring=True)
 
-    def _explore(self, point: np.ndarray, salience: Salience) -> Mission:
+    def _explore(self, point: np.ndarray) -> Mission:
         """Go to the event nearest to a proposed point, and on towards it or at random.
 
         Of some proposals it is the one whose event has been visited least.
         """
-        proposals = [salience.propose(self.rng) for _ in range(N_PROPOSALS)]
+        proposals = [self.salience.propose(self.rng) for _ in range(N_PROPOSALS)]
         points = [proposal for proposal in proposals if proposal is not None]
         if not points:
             return self._random_walk(point)
@@ -176,10 +178,16 @@ class Missions:
         if math.dist(point.tolist(), goal.tolist()) <= self.graph.radius:
             return self._travel()  # to come back from somewhere else
         if self.graph.locate(goal) == NOWHERE and self.rng.random() < LOOK_FOR_A_WAY:
-            if self.rng.random() < FROM_NEAREST:
-                return self._beyond(int(self.graph.distances(goal).argmin()), goal)
-            return self._explore(point, FrontierSalience(self.graph, goal))
+            return self._look_for(goal)
         return Mission(goal.copy())
+
+    def _look_for(self, goal: np.ndarray) -> Mission:
+        """Go to the event nearest to the goal, or to any other place that nobody knows, and on from there."""
+        place = goal
+        if self.rng.random() >= FROM_NEAREST:
+            points = self.rng.uniform(*FrontierSalience(self.graph, goal).box(), (MOST_PROPOSALS, self.graph.goal_dim))
+            place = next((point for point in points if self.graph.locate(point) == NOWHERE), goal)
+        return self._beyond(int(self.graph.distances(place).argmin()), place)
 
     # -- saving -------------------------------------------------------------------------------------------------------
 

@@ -1,5 +1,6 @@
 """What trajectories and runs teach the graph: where one has been, what was crossed, how runs ended."""
 
+from dataclasses import astuple, dataclass
 from typing import Any
 
 import numpy as np
@@ -21,15 +22,34 @@ FAR_PRIOR = 2.0
 _COLUMNS = 4
 
 
+@dataclass
 class _Stay:
-    """A stretch of a trajectory within one event: when it was nearest to the event's centre."""
+    """A stretch of a trajectory within one event.
 
-    def __init__(self, event: int, step: int, distance: float) -> None:
-        self.event, self.step, self.distance = event, step, distance
+    :param event: index of the event
+    :param entered: step at which it began
+    :param left: last step so far
+    :param step: step at which it was nearest to the event's centre
+    :param distance: how near, in goal units
+    """
+
+    event: int
+    entered: int
+    left: int
+    step: int
+    distance: float
 
     def note(self, step: int, distance: float) -> None:
+        self.left = step
         if distance < self.distance:
             self.step, self.distance = step, distance
+
+    def steps_to(self, later: "_Stay", most: int) -> int:
+        """Return the steps from here to a later stay: from middle to middle, or, if those are more than ``most``, since the
+        trajectory lingered, from edge to edge.
+        """
+        steps = later.step - self.step
+        return steps if steps <= most else later.entered - self.left
 
 
 class Witness:
@@ -102,18 +122,19 @@ class Witness:
         if stays:
             self._left(env)
         self.graph.visits[event] += 1
-        self._stays[env].append(_Stay(event, step, distance))
+        self._stays[env].append(_Stay(event, step, step, step, distance))
         return is_new
 
     def _left(self, env: int) -> None:
         """A stay is over: every event that was passed shortly before has been crossed from."""
         *earlier, last = self._stays[env]
-        recent = [stay for stay in earlier if last.step - stay.step <= self.graph.walk_steps]
+        most = self.graph.walk_steps
+        recent = [stay for stay in earlier if stay.steps_to(last, most) <= most]
         seen = set()
         for stay in reversed(recent):
             if stay.event != last.event and stay.event not in seen:
                 seen.add(stay.event)  # only the last time it was passed: a detour is no way
-                self.graph.crossed(stay.event, last.event, max(last.step - stay.step, 1))
+                self.graph.crossed(stay.event, last.event, max(stay.steps_to(last, most), 1))
         self._stays[env] = [*recent, last]
 
     def _bound_degree(self) -> None:
@@ -201,7 +222,7 @@ class Witness:
             "samples": self._samples[: min(self._n_samples, N_SAMPLES)].copy(),
             "n_samples": self._n_samples,
             "n_steps": self._n_steps,
-            "stays": [[[stay.event, stay.step, stay.distance] for stay in stays] for stays in self._stays],
+            "stays": [[list(astuple(stay)) for stay in stays] for stays in self._stays],
             "step": list(self._step),
             "began": self._began.copy(),
         }
