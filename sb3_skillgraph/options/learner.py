@@ -92,10 +92,11 @@ class OptionLearner(TD3):
         :param gradient_steps: number of updates
         :param batch_size: transitions in a minibatch
         """
-        # Switch to train mode (this affects batch norm / dropout)
-        self.policy.set_training_mode(True)
         self._update_learning_rate([self.actor.optimizer, self.critic.optimizer])
         compiled = self._compiled_update()
+        if compiled is None:
+            # Switch to train mode (this affects batch norm / dropout)
+            self.policy.set_training_mode(True)
         assert self.replay_buffer is not None
         actor_losses, critic_losses = [], []
         with flushed_denormals():
