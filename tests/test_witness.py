@@ -109,18 +109,17 @@ def test_only_events_within_the_steps_of_a_walk_are_crossed() -> None:
     assert graph.edges.crossing_steps.max() <= 8
 
 
-def test_who_stays_for_long_crosses_in_the_steps_from_edge_to_edge() -> None:
+def test_who_stays_for_long_crosses_in_the_steps_from_where_it_was_nearest_of_late() -> None:
     witness = make_witness(walk_steps=10)
     walk(witness, [0.0] * 50 + [0.5, 1.0, 1.5] + [2.0] * 50 + [2.5, 4.0, 6.0])
-    # Nearest to the middles were their first steps, too long ago.
     found = crossings(witness.graph)
     assert set(forward(witness.graph)) == {("e0", "e1"), ("e1", "e2")}  # through the second it took longer than a walk may
-    assert found["e0", "e1"][2] <= 3.0
-    assert found["e1", "e2"][2] <= 3.0
+    assert 3.0 <= found["e0", "e1"][2] <= 8.0
+    assert 2.0 <= found["e1", "e2"][2] <= 7.0
 
 
 @every_time
-@given(seeds, st.integers(1, 15))
+@given(seeds, st.integers(2, 15))
 def test_one_event_after_the_other_makes_an_edge_however_long_either_lasted(seed: int, walk_steps: int) -> None:
     rng = np.random.default_rng(seed)
     witness = make_witness(walk_steps=walk_steps)

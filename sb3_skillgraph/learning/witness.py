@@ -24,32 +24,36 @@ _COLUMNS = 4
 
 @dataclass
 class _Stay:
-    """A stretch of a trajectory within one event.
+    """A stretch of a trajectory within one event, which was reached and left when it was nearest to the event's centre.
+
+    Of a trajectory that lingered only what lies near in time to its beginning, or to its end, counts.
 
     :param event: index of the event
     :param entered: step at which it began
-    :param left: last step so far
-    :param step: step at which it was nearest to the event's centre
-    :param distance: how near, in goal units
+    :param reached: step at which it was nearest to the centre, not long after it began
+    :param reached_at: how near, in goal units
+    :param left: step at which it was nearest to the centre, not long ago
+    :param left_at: how near, in goal units
     """
 
     event: int
     entered: int
+    reached: int
+    reached_at: float
     left: int
-    step: int
-    distance: float
+    left_at: float
 
-    def note(self, step: int, distance: float) -> None:
-        self.left = step
-        if distance < self.distance:
-            self.step, self.distance = step, distance
+    def note(self, step: int, distance: float, long: int) -> None:
+        """Go on.
 
-    def steps_to(self, later: "_Stay", most: int) -> int:
-        """Return the steps from here to a later stay: from middle to middle, or, if those are more than ``most``, since the
-        trajectory lingered, from edge to edge.
+        :param step: step of the trajectory
+        :param distance: from the centre, in goal units
+        :param long: how many steps are long
         """
-        steps = later.step - self.step
-        return steps if steps <= most else later.entered - self.left
+        if distance < self.reached_at and step - self.entered <= long:
+            self.reached, self.reached_at = step, distance
+        if distance < self.left_at or step - self.left > long:
+            self.left, self.left_at = step, distance
 
 
 class Witness:
@@ -117,24 +121,23 @@ class Witness:
         stays, step = self._stays[env], self._step[env]
         distance = float(np.linalg.norm(self.graph.centers[event] - point))
         if stays and stays[-1].event == event:
-            stays[-1].note(step, distance)
+            stays[-1].note(step, distance, (self.graph.walk_steps - 1) // 2)
             return is_new
         if stays:
             self._left(env)
         self.graph.visits[event] += 1
-        self._stays[env].append(_Stay(event, step, step, step, distance))
+        self._stays[env].append(_Stay(event, step, step, distance, step, distance))
         return is_new
 
     def _left(self, env: int) -> None:
         """A stay is over: every event that was passed shortly before has been crossed from."""
         *earlier, last = self._stays[env]
-        most = self.graph.walk_steps
-        recent = [stay for stay in earlier if stay.steps_to(last, most) <= most]
+        recent = [stay for stay in earlier if last.reached - stay.left <= self.graph.walk_steps]
         seen = set()
         for stay in reversed(recent):
             if stay.event != last.event and stay.event not in seen:
                 seen.add(stay.event)  # only the last time it was passed: a detour is no way
-                self.graph.crossed(stay.event, last.event, max(stay.steps_to(last, most), 1))
+                self.graph.crossed(stay.event, last.event, max(last.reached - stay.left, 1))
         self._stays[env] = [*recent, last]
 
     def _bound_degree(self) -> None:
