@@ -14,6 +14,9 @@ RIDGE = 3.0
 FIRST_GUESS = 0.25
 #: A crossing is hasty that was so many times faster than the fastest walks, which are this quantile of all that succeed.
 HASTY, FASTEST = 1.5, 0.1
+#: Event radii from which on a walk is long: a run ends a radius before the centre, which is much of a short walk. Speed is
+#: measured on long walks where there are so many.
+LONG, ENOUGH_LONG = 3.0, 10
 #: Success of hasty walks, and share of their failures that ends far away, before there are runs to learn from.
 HASTY_GUESS, HASTY_LOSS = 0.1, 0.5
 #: Least standard deviation of a feature: what never varies tells nothing.
@@ -152,7 +155,10 @@ class WalkModel:
             return
         taken, distance = success_steps[reached] / successes[reached], np.maximum(kind.distance[reached], 1e-3)
         self.steps_per_radius = float(success_steps[reached].sum() / (successes[reached] * distance).sum())
-        self.fastest = float(np.quantile(taken / distance, FASTEST))
+        pace, long = taken / distance, distance >= LONG
+        if np.count_nonzero(long) >= ENOUGH_LONG:
+            pace = taken[long] / (distance[long] - 1.0)
+        self.fastest = float(np.quantile(pace, FASTEST))
         root = np.sqrt(successes[reached])
         ridge = np.sqrt(RIDGE) * np.eye(len(self.pace))
         left = np.concatenate([_pace_features(kind)[reached] * root[:, None], ridge])

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sb3_skillgraph.walk_model import FIRST_GUESS, HASTY, HASTY_LOSS, Kind, WalkModel
+from sb3_skillgraph.walk_model import ENOUGH_LONG, FIRST_GUESS, HASTY, HASTY_LOSS, Kind, WalkModel
 
 
 def kinds(*rows: tuple[float, float, float, float]) -> Kind:
@@ -89,6 +89,19 @@ def test_haste_is_measured_beside_the_fastest_walks() -> None:
     model.fastest = 5.0
     border = 5.0 * 2.0 / HASTY
     assert model.is_hasty(kinds((2.0, 0.99 * border, 1.0, 0.0), (2.0, 1.01 * border, 1.0, 0.0))).tolist() == [True, False]
+
+
+def test_speed_is_that_of_long_walks_without_the_radius_that_they_are_spared() -> None:
+    # Walkers of 5 steps a radius, whose runs end one radius early: a short walk looks twice as fast as it is.
+    short = [((2.0, 10.0, 1.0, 0.0), 4.0, 0.0, 5.0)] * 30
+    long = [((6.0, 30.0, 1.0, 0.0), 4.0, 0.0, 25.0)]
+    for n_long, fastest in ((ENOUGH_LONG - 1, 2.5), (ENOUGH_LONG, 5.0)):
+        runs = short + n_long * long
+        kind = kinds(*(row for row, *_ in runs))
+        successes, failures, steps = np.array([rest for _, *rest in runs]).T
+        model = WalkModel()
+        model.fit(kind, successes, failures, successes * steps)
+        assert model.fastest == pytest.approx(fastest)
 
 
 def test_hasty_walks_are_distrusted_although_none_has_been_tried_yet() -> None:
