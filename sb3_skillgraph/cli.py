@@ -14,9 +14,9 @@ import torch as th
 from rich.console import Console
 from rich.table import Table
 
-import sb3_skillgraph.envs  # noqa: F401 - registers the environments
 from sb3_skillgraph.agent import SkillGraphAgent
 from sb3_skillgraph.baselines import RandomWalk, StraightOn
+from sb3_skillgraph.envs import find
 from sb3_skillgraph.evaluation import NoPairsError, PairsResult, Predictor, evaluate_pairs
 from sb3_skillgraph.experiments.commands import add_compare, add_figure, add_status
 from sb3_skillgraph.experiments.console import UserError, assignment, for_people, positive
@@ -252,7 +252,7 @@ def _demo(args: argparse.Namespace) -> int:
 def _check_env_id(env_id: str) -> None:
     """Find an environment by its id, importing the package named before a colon."""
     try:
-        gym.spec(env_id)
+        find(env_id)
     except (gym.error.Error, ImportError) as error:
         known = [id for id in gym.registry if id.rpartition("/")[0] or "Maze" in id]
         short = {id.rpartition("/")[2]: id for id in known}

@@ -347,3 +347,32 @@ def test_an_entry_wins_over_defaults(tmp_path: Path) -> None:
     path = tmp_path / "custom.yml"
     path.write_text("defaults: {gamma: 0.9, n_timesteps: 1e5}\nMine-v0: {gamma: 0.95, learning_rate: 1e-3}\n")
     assert load_hyperparams("Mine-v0", path) == {"gamma": 0.95, "n_timesteps": 100_000, "learning_rate": 0.001}
+
+
+# -- other people's environments --------------------------------------------------------------------------------------
+
+PACKAGE = '''
+import gymnasium as gym
+import numpy as np
+from sb3_skillgraph.envs import ToyMazeEnv
+
+
+class Mine(ToyMazeEnv):
+    """An environment of somebody's own."""
+
+
+gym.register("Mine-v0", entry_point=Mine)
+'''
+
+
+@pytest.mark.parametrize("env_id", ["gymnasium_robotics:FetchReach-v4", "FetchReach-v4", "my_own_mazes:Mine-v0"])
+def test_environments_of_other_packages_are_found(env_id: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "my_own_mazes.py").write_text(PACKAGE)
+    monkeypatch.syspath_prepend(tmp_path)
+    steps = ["--steps", "150", "--hyperparams", "learning_starts=100"]
+    assert cli.main(["train", env_id, "--out", str(tmp_path / "run"), *steps]) == 0
+    assert {path.name for path in (tmp_path / "run").iterdir()} == TRAINED
+
+
+def test_a_package_that_is_not_there_is_named(capsys: Capture) -> None:
+    assert "No module named 'no_such_package'" in error_line(capsys, ["train", "no_such_package:Mine-v0"])

@@ -1,5 +1,6 @@
 """Maze tasks for skill graphs; importing this package registers ``SkillGraph/*`` with Gymnasium."""
 
+import importlib
 from typing import Any
 
 import gymnasium as gym
@@ -20,6 +21,7 @@ __all__ = [
     "MazeMap",
     "TellStuck",
     "ToyMazeEnv",
+    "find",
     "on_its_back",
     "register",
 ]
@@ -56,6 +58,23 @@ def register() -> None:
     for env_id, (entry_point, kwargs) in _TASKS.items():
         if env_id not in gym.registry:
             gym.register(env_id, entry_point=entry_point, kwargs=kwargs)
+
+
+def find(env_id: str) -> None:
+    """See to it that an environment is registered: import the package that its id names, or else gymnasium-robotics.
+
+    :param env_id: ``"package:Name-v0"``, or the id of an environment that is registered, or of gymnasium-robotics
+    :raises ImportError: if the package cannot be imported
+    :raises gymnasium.error.Error: if there is no such environment
+    """
+    package, _, name = env_id.rpartition(":")
+    if package:
+        importlib.import_module(package)
+    elif name not in gym.registry:
+        import gymnasium_robotics  # when it is asked for: it takes a while to import
+
+        gym.register_envs(gymnasium_robotics)
+    gym.spec(name)
 
 
 register()

@@ -9,6 +9,7 @@ from typing import Any
 import gymnasium as gym
 import yaml
 
+from sb3_skillgraph.envs import find
 from sb3_skillgraph.experiments.learners import ALGORITHMS
 from sb3_skillgraph.hyperparams import did_you_mean
 
@@ -134,7 +135,7 @@ def _seeds(seeds: list[Any], where: str) -> list[int]:
 
 def _check_id(id: str, where: str) -> None:
     try:
-        gym.spec(id)
+        find(id)
     except (gym.error.Error, ImportError) as error:
         raise ValueError(f"{where}: {error}") from error
 
