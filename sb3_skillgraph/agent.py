@@ -421,7 +421,8 @@ class SkillGraphAgent(OffPolicyAlgorithm):
         """
         Learn to reach a goal the graph does not reach yet (section 3.3, cases b and c).
 
-        For ``total_timesteps`` the agent pursues nothing else: it goes there, or looks for a way from the event nearest to it.
+        For ``total_timesteps`` the agent pursues nothing else. While it has not been there it looks for a way, from the event
+        nearest to the goal and from others; whoever arrives goes elsewhere, to come back.
 
         :param goal: shape ``(goal_dim,)``
         :param start: where episodes begin meanwhile, for environments whose ``reset`` takes ``options={"start": ...}``

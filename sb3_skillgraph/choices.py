@@ -169,6 +169,7 @@ class ChoiceModel:
         # A guess of the steps counts for one run.
         steps = (self.model.steps(kinds) + edges.success_steps * aging) / (1.0 + successes)
         failed_steps = (self.model.patience * timeout(steps) + edges.failure_steps * aging) / (1.0 + failures)
+        failed_steps = np.minimum(failed_steps, timeout(steps))  # it may have been allowed more when it was slower
         loss = self._with_kin(self._loss(kinds), hasty, self.far_failures(kinds), failures)
         weight = edges.landing_weight * aging[:, None]
         times = (steps, failed_steps)
@@ -256,17 +257,23 @@ class ChoiceModel:
             near = near[:NEAR_EVENTS]
         if home == NOWHERE:
             guessed = self._guessed(near, near, vertex, distance[near], np.zeros(len(near)), runs)
-            return guessed if everywhere else self._short(guessed)
+            return guessed if everywhere else self._short(guessed, least=1)
         beside = self._beside(self._edges(graph.edges.target == home, replaced, tried), home, distance, runs)
         near = near[~np.isin(near, beside.source)]
         seen = (near == home).astype(np.float64)  # somebody was near the goal, in its event
-        found = Choices.join([self._guessed(near, near, vertex, distance[near], seen, runs), beside])
-        return found if everywhere else self._short(found)
+        guessed = self._guessed(near, near, vertex, distance[near], seen, runs)
+        if not everywhere:
+            guessed = self._short(guessed, least=0 if len(beside.source) else 1)
+        return Choices.join([guessed, beside])
 
-    def _short(self, choices: Choices) -> Choices:
-        """Return those that are no longer than the walks of the graph; the shortest where there is none."""
-        shortest = float(choices.steps.min(initial=np.inf))
-        return choices.take(np.flatnonzero(choices.steps <= max(shortest, self.graph.walk_steps)))
+    def _short(self, guessed: Choices, least: int) -> Choices:
+        """Return the guessed walks that are no longer than those of the graph.
+
+        :param guessed: walks to the goal
+        :param least: how many to keep, however long they are: the shortest
+        """
+        rank = np.argsort(np.argsort(guessed.steps, kind="stable"), kind="stable")
+        return guessed.take(np.flatnonzero((guessed.steps <= self.graph.walk_steps) | (rank < least)))
 
     def _beside(self, walks: Choices, home: int, distance: np.ndarray, runs: Runs) -> Choices:
         """Return walks to the goal for the walks to its event.
@@ -284,6 +291,7 @@ class ChoiceModel:
             guess=BESIDE * walks.guess,
             successes=BESIDE * walks.successes,
             steps=stretch * walks.steps,
+            failed_steps=stretch * walks.failed_steps,
         )
         for i, source in enumerate(beside.source.tolist()):
             for success, where, number in runs.of(source, vertex):

@@ -50,7 +50,7 @@ class SkillGraph:
         self._centers = np.zeros((64, goal_dim))
         self.walk_ids: list[str] = []  # of the walks to the events, in their order
         self._index: dict[str, int] = {}  # of events, by their ids and by those of the walks to them
-        self._n_made = 0
+        self.n_made = 0  # events so far, those that were merged included
         self._nx: tuple[int, networkx.DiGraph] | None = None
 
     def __repr__(self) -> str:
@@ -106,15 +106,15 @@ class SkillGraph:
         :return: its index
         """
         i = len(self.events)
-        event = Event(f"e{self._n_made}", np.array(center, dtype=np.float64), self.radius, salient)
+        event = Event(f"e{self.n_made}", np.array(center, dtype=np.float64), self.radius, salient)
         if i == len(self._centers):
             self._centers = np.concatenate([self._centers, np.zeros_like(self._centers)])
             self.visits = np.concatenate([self.visits, np.zeros_like(self.visits)])
         self.events.append(event)
-        self.walk_ids.append(f"w{self._n_made}")
+        self.walk_ids.append(f"w{self.n_made}")
         self._centers[i], self.visits[i] = event.center, 0.0
         self._index[event.id] = self._index[self.walk_ids[i]] = i
-        self._n_made += 1
+        self.n_made += 1
         self.version += 1
         return i
 
@@ -308,7 +308,7 @@ class SkillGraph:
             "visits": self.visits[: len(self.events)].copy(),
             "cover_radius": self.cover_radius,
             "now": self.now,
-            "n_made": self._n_made,
+            "n_made": self.n_made,
         }
 
     def set_state(self, state: dict[str, Any]) -> None:
@@ -320,5 +320,5 @@ class SkillGraph:
         self._index = self._build_index()
         self.visits[: len(self.events)] = state["visits"]
         self.edges.set_state(state["edges"])
-        self.cover_radius, self.now, self._n_made = state["cover_radius"], state["now"], state["n_made"]
+        self.cover_radius, self.now, self.n_made = state["cover_radius"], state["now"], state["n_made"]
         self.version += 1

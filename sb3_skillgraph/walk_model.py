@@ -22,13 +22,15 @@ HASTY_GUESS, HASTY_LOSS = 0.1, 0.5
 #: Least standard deviation of a feature: what never varies tells nothing.
 LEAST_SCALE = 0.1
 N_FEATURES = 7
-#: Environment steps of failed runs that the first guess of their length counts for.
+#: Environment steps of failed runs that the first guess of their length counts for: about two runs.
 PATIENCE_PRIOR = 100.0
+#: A run may take so many times the steps that it is expected to take, and so many more: room for detours.
+TIMES, MORE = 2.0, 15.0
 
 
 def timeout(steps: Any) -> Any:
     """Return the environment steps that a run may take which is expected to succeed in ``steps``: a number, or an array."""
-    return 2.0 * steps + 15.0
+    return TIMES * steps + MORE
 
 
 class Kind(NamedTuple):
@@ -128,7 +130,7 @@ class WalkModel:
         :param allowed: environment steps that they might have taken
         """
         self.loss = loss
-        self.patience = (taken + PATIENCE_PRIOR) / (allowed + PATIENCE_PRIOR)
+        self.patience = min((taken + PATIENCE_PRIOR) / (allowed + PATIENCE_PRIOR), 1.0)
         self.version += 1
 
     def _fit_success(self, kind: Kind, successes: np.ndarray, failures: np.ndarray) -> None:

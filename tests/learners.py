@@ -62,7 +62,7 @@ def distance(a: Any, b: Any) -> float:
 
 def by_torch(model: Any) -> Any:
     """Have a model of ours take the reference update, and return it."""
-    model._compiled_update = lambda: None
+    model._why_reference = lambda: "it is asked for"
     return model
 
 

@@ -11,7 +11,7 @@ from sb3_skillgraph.graph import SkillGraph
 from sb3_skillgraph.learning import missions as missions_module
 from sb3_skillgraph.learning.missions import MAX_FAILURES, Mission, Missions
 from sb3_skillgraph.learning.rollout import HOLD, Rollout
-from sb3_skillgraph.learning.salience import MARGIN, FrontierSalience, RandomSalience
+from sb3_skillgraph.learning.salience import MARGIN, FrontierSalience, RandomSalience, box_around
 from sb3_skillgraph.learning.witness import Witness
 from sb3_skillgraph.memory.store import TransitionStore
 from sb3_skillgraph.planning import Planner
@@ -207,7 +207,7 @@ def test_a_way_is_looked_for_to_a_goal_where_nobody_has_been() -> None:
     assert 130 < len(looking) < 185
     assert all(mission.explore_steps == EXPLORATION for mission in looking)
     assert {mission.beyond is None for mission in looking} == {True, False}
-    # Half of them set out from the nearest event, and of the others some: the way may begin elsewhere.
+    # Some set out from the event that is nearest, and some from elsewhere: the way may begin there.
     nearest = [mission for mission in looking if mission.goal.tolist() == [8.0, 0.0]]
     assert 0.2 < len(nearest) / len(looking) < 0.8
     assert {tuple(mission.goal) for mission in looking} == {tuple(center) for center in missions.graph.centers}
@@ -239,7 +239,7 @@ def test_the_frontier_lies_in_the_box_around_what_was_visited_and_a_little_beyon
     graph, rng = line_graph(3), np.random.default_rng(0)
     salience = FrontierSalience(graph)
     points = np.array([salience.propose(rng) for _ in range(500)])
-    lower, upper = salience.box()
+    lower, upper = box_around(graph.centers, graph.radius)
     assert lower.tolist() == [-MARGIN, -MARGIN]
     assert upper.tolist() == [8.0 + MARGIN, MARGIN]
     assert ((points >= lower) & (points <= upper)).all()
@@ -431,7 +431,11 @@ def test_a_new_mission_forgets_what_happened_on_the_last() -> None:
     learning.missions.current[0] = Mission(learning.points[0] + [0.2, 0.0], clean=True)
     learning.step()
     state = learning.rollout.state
-    assert (state.elapsed[0], state.option[0], state.run_count.sum()) == (0, "", 0)
+    assert (state.elapsed[0], state.option[0], state.run_count.sum()) == (4, "", 0)
+    assert state.pace.any()  # but not how it moves: the episode goes on
+    learning.missions.current[0] = Mission(np.array([50.0, 0.0]), clean=True)
+    learning.step(done=True)
+    assert (learning.rollout.state.elapsed[0], learning.rollout.state.pace.any()) == (0, False)
 
 
 @pytest.mark.parametrize("same_envs", [True, False])

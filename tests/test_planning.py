@@ -590,6 +590,19 @@ def test_the_walk_to_a_goal_far_away_is_begun_only_where_there_is_nothing_else_t
         assert found.target[found.source == 13].tolist() == expected
 
 
+def test_a_record_that_is_bad_is_no_reason_to_guess() -> None:
+    graph = line_graph(3)
+    tried(graph, 0, 1, 1, 40)
+    for _ in range(30):
+        graph.ran(0, 1, True, 1, 60)
+        graph.ran(0, 1, False, 0, 60)
+    goal = graph.centers[1] + [0.5, 0.0]
+    found = everything(graph, WalkModel(), at(graph, 0), goal)
+    (row,) = np.flatnonzero((found.source == 4) & (found.target == 3))
+    assert found.steps[row] > graph.walk_steps  # longer than walks are, but it is what was seen
+    assert found.failures[row] == pytest.approx(70.0)
+
+
 def test_who_is_nowhere_can_walk_to_the_nearest_events() -> None:
     graph = line_graph(12)
     start = Start(np.array([20.5, 5.0]), NOWHERE)

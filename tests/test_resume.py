@@ -244,7 +244,7 @@ def test_going_on_with_the_other_update_is_told(trained_files: tuple[Path, Path]
     agent = SkillGraphAgent.load(trained_files[0], env=gym.make(TOY))
     agent.load_replay_buffer(trained_files[1])
     told = pytest.warns(UserWarning, match="trained by the kernel update and goes on with the reference update")
-    with mock.patch.object(OptionLearner, "_compiled_update", lambda learner: None), told:
+    with mock.patch.object(OptionLearner, "_why_reference", lambda learner: "no reason"), told:
         agent.learn(10, reset_num_timesteps=False)
 
 

@@ -236,9 +236,45 @@ def test_each_environment_stands_still_for_itself() -> None:
     for k in range(2 * STILL_STEPS):
         points = np.array([[0.0, 0.0], [0.1 * min(k, 9), 0.0]])
         _, state = runner.act(seen_at(points), np.full((2, 2), [12.0, 0.0]), state)
-        assert state.still[1] == max(k - 9, 0)
-        assert state.still[0] == 0  # where nothing has ever moved nothing is known of what moving is
-    assert state.pace.tolist() == [0.0, pytest.approx(0.1)]
+        assert state.still.tolist() == [k, max(k - 9, 0)]
+    assert state.pace[0].tolist() == [0.0] * 4
+    assert state.pace[1, 0] == pytest.approx(0.1, rel=0.1)
+
+
+def moving(seen: list[list[float]], points: list[list[float]]) -> RunnerState:
+    """The state of an agent that has seen and been what it is told, under one option."""
+    runner, state = make_runner(known_line()), RunnerState.fresh(1, 2, len(seen[0]))
+    for observation, point in zip(seen, points, strict=True):
+        at = {"observation": np.array([observation]), "achieved_goal": np.array([point])}
+        _, state = runner.act(at, np.array([[12.0, 0.0]]), state)
+    return state
+
+
+def test_a_jump_is_no_pace_beside_which_walking_is_standing() -> None:
+    points = [[0.2 * k, 0.0] for k in range(10)] + [[60.0 + 0.2 * k, 0.0] for k in range(20)]
+    assert moving(points, points).still[0] == 0
+
+
+def test_who_moves_without_seeing_it_does_not_stand_still() -> None:
+    points = [[0.2 * k, 0.0] for k in range(20)]
+    assert moving([[0.5]] * 20, points).still[0] == 0  # at a constant speed
+    assert moving([[]] * 20, points).still[0] == 0
+    assert moving([[0.5]] * 20, [[0.2 * min(k, 5), 0.0] for k in range(20)]).still[0] == 14
+
+
+def test_large_entries_do_not_hide_small_ones() -> None:
+    seen = [[1e6 * (k % 2), 0.0] for k in range(6)] + [[0.0, 1e-3 * k] for k in range(20)]
+    assert moving(seen, [[0.0, 0.0]] * 26).still[0] == 0
+
+
+def test_how_an_agent_moves_is_known_when_it_has_something_else_to_do() -> None:
+    points = [[0.2 * k, 0.0] for k in range(5)]
+    state = moving(points, points)
+    for same_episode in (True, False):
+        anew = state.begun_anew(np.ones(1, dtype=bool), same_episode=same_episode)
+        assert (anew.option[0], anew.still[0], anew.run_count.sum()) == ("", 0, 0)
+        assert bool(anew.pace.any()) is same_episode
+        assert anew.elapsed[0] == (5 if same_episode else 0)
 
 
 def test_a_run_to_an_event_that_is_merged_away_meanwhile_ends_like_others() -> None:

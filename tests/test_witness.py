@@ -266,7 +266,7 @@ def test_a_run_of_a_walk_is_recorded_on_its_edge() -> None:
 
 def test_it_is_learned_how_long_failed_runs_take() -> None:
     expected = []
-    for steps in (10, 40):
+    for steps in (10, 20):
         witness = make_witness()
         walk(witness, [*straight(6.0), 8.0])
         for _ in range(200):

@@ -8,7 +8,7 @@ import numpy as np
 
 from sb3_skillgraph.edges import NOWHERE
 from sb3_skillgraph.graph import SkillGraph
-from sb3_skillgraph.learning.salience import FrontierSalience, Salience
+from sb3_skillgraph.learning.salience import Salience, box_around
 from sb3_skillgraph.runner import Run
 
 #: Failed runs after which a mission is given up.
@@ -19,11 +19,12 @@ EXPLORE = 0.9
 N_PROPOSALS = 3
 #: Share of the explorations that go on towards the proposed point; the others walk at random.
 TOWARDS = 0.5
-#: Share of the missions that look for a way to a goal which adaptation is for, while nobody has been there; of those the
-#: share that sets out from the event nearest to it: what lies nearest may be the far side of a wall.
+#: Share of the missions that look for a way to a goal which adaptation is for, while nobody has been there, rather than go
+#: straight there; of those the share that sets out from the event nearest to it: often, but what lies nearest may be the far
+#: side of a wall.
 LOOK_FOR_A_WAY, FROM_NEAREST = 0.8, 0.3
-#: Points that are proposed until one lies where nobody has been.
-MOST_PROPOSALS = 20
+#: Points of the box that are drawn to find one where nobody has been: where 10 % of it is unknown one of 20 lies there.
+N_DRAWN = 20
 #: Share of the missions without noise: noise makes its own luck, and only runs without it go into records.
 CLEAN = 0.5
 
@@ -111,7 +112,7 @@ class Missions:
         was_exploring = mission.exploring
         if run is not None:
             mission.n_failures += not run.success
-            if mission.exploring and not run.success and run.steps < self.exploration_steps:
+            if mission.exploring and run.stood_still:
                 mission.beyond = None  # who cannot get on towards the point walks at random
         over = self._over(mission, point)
         if over or done:
@@ -185,7 +186,8 @@ class Missions:
         """Go to the event nearest to the goal, or to any other place that nobody knows, and on from there."""
         place = goal
         if self.rng.random() >= FROM_NEAREST:
-            points = self.rng.uniform(*FrontierSalience(self.graph, goal).box(), (MOST_PROPOSALS, self.graph.goal_dim))
+            box = box_around(np.concatenate([self.graph.centers, goal[None]]), self.graph.radius)
+            points = self.rng.uniform(*box, (N_DRAWN, self.graph.goal_dim))
             place = next((point for point in points if self.graph.locate(point) == NOWHERE), goal)
         return self._beyond(int(self.graph.distances(place).argmin()), place)
 

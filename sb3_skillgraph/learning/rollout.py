@@ -193,7 +193,7 @@ class Rollout:
             self.n_stuck += bool(stuck[i])
         self.hold_left = np.where(dones, 0, self.hold_left)
         if over.any():
-            self.state = self.state.begun_anew(over)
+            self.state = self.state.begun_anew(over & ~dones, same_episode=True).begun_anew(over & dones)
 
     def _salient(self, point: np.ndarray) -> None:
         """A proposed point was reached: it becomes a vertex, where there is none."""

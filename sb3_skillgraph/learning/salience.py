@@ -43,23 +43,23 @@ class FrontierSalience:
     (the Voronoi bias of an RRT, section 2.4).
 
     :param graph: the skill graph, whose events lie all over what has been visited
-    :param goal: a place that the box is to hold as well, shape ``(goal_dim,)``; None for none
     """
 
-    def __init__(self, graph: SkillGraph, goal: np.ndarray | None = None) -> None:
+    def __init__(self, graph: SkillGraph) -> None:
         self.graph = graph
-        self.goal = goal
 
     def propose(self, rng: np.random.Generator) -> np.ndarray | None:
         """Propose a point in or near the box; None before anything was visited."""
         if not self.graph.events:
             return None
-        lower, upper = self.box()
-        return rng.uniform(lower, upper)
+        return rng.uniform(*box_around(self.graph.centers, self.graph.radius))
 
-    def box(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the corners of the box, each of shape ``(goal_dim,)``."""
-        inside, margin = self.graph.centers, MARGIN * self.graph.radius
-        if self.goal is not None:
-            inside = np.concatenate([inside, self.goal[None]])
-        return inside.min(axis=0) - margin, inside.max(axis=0) + margin
+
+def box_around(points: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the corners of a box that is a little larger than some points ask for, each of shape ``(goal_dim,)``.
+
+    :param points: shape ``(n, goal_dim)``
+    :param radius: the event radius, in goal units
+    """
+    margin = MARGIN * radius
+    return points.min(axis=0) - margin, points.max(axis=0) + margin

@@ -32,16 +32,14 @@ class _Stay:
     :param entered: step at which it began
     :param reached: step at which it was nearest to the centre, not long after it began
     :param reached_at: how near, in goal units
-    :param left: step at which it was nearest to the centre, not long ago
-    :param left_at: how near, in goal units
+    :param recent: its last steps and how near to the centre each was
     """
 
     event: int
     entered: int
     reached: int
     reached_at: float
-    left: int
-    left_at: float
+    recent: list[tuple[int, float]]
 
     def note(self, step: int, distance: float, long: int) -> None:
         """Go on.
@@ -52,8 +50,12 @@ class _Stay:
         """
         if distance < self.reached_at and step - self.entered <= long:
             self.reached, self.reached_at = step, distance
-        if distance < self.left_at or step - self.left > long:
-            self.left, self.left_at = step, distance
+        self.recent = [*self.recent[-long:], (step, distance)] if long else [(step, distance)]
+
+    @property
+    def left(self) -> int:
+        """Step at which it was nearest to the centre, not long before it ended: the last of equals."""
+        return min(reversed(self.recent), key=lambda passed: passed[1])[0]
 
 
 class Witness:
@@ -116,8 +118,9 @@ class Witness:
         """Note in which event the trajectory is; a place that belongs to none becomes a landmark."""
         event, is_new = self.graph.locate(point), False
         if event == NOWHERE:
+            n_made = self.graph.n_made
             event = self.add_event(point, salient=False)
-            is_new = event == len(self.graph.events) - 1
+            is_new = self.graph.n_made > n_made
         stays, step = self._stays[env], self._step[env]
         distance = float(np.linalg.norm(self.graph.centers[event] - point))
         if stays and stays[-1].event == event:
@@ -126,7 +129,7 @@ class Witness:
         if stays:
             self._left(env)
         self.graph.visits[event] += 1
-        self._stays[env].append(_Stay(event, step, step, distance, step, distance))
+        self._stays[env].append(_Stay(event, step, step, distance, [(step, distance)]))
         return is_new
 
     def _left(self, env: int) -> None:
@@ -201,9 +204,9 @@ class Witness:
             np.concatenate([edges.failures * aging, 1.0 - success]),
             np.concatenate([edges.success_steps * aging, success * steps]),
         )
-        model.fit_failures(self._loss(kinds), *self._patience())
+        model.fit_failures(self._far_share(kinds), *self._time_of_failures())
 
-    def _loss(self, kinds: Kind) -> np.ndarray:
+    def _far_share(self, kinds: Kind) -> np.ndarray:
         """Return which share of failures lands far away, for hasty walks and for others."""
         graph, model = self.graph, self.choice_model.model
         hasty = model.is_hasty(kinds)
@@ -211,7 +214,7 @@ class Witness:
         kinds_of_walks = ((hasty, HASTY_LOSS), (~hasty, 0.0))
         return np.array([(far[i].sum() + FAR_PRIOR * guess) / (failures[i].sum() + FAR_PRIOR) for i, guess in kinds_of_walks])
 
-    def _patience(self) -> tuple[float, float]:
+    def _time_of_failures(self) -> tuple[float, float]:
         """Return the steps that failed runs took, and those that they might have taken."""
         edges, aging = self.graph.edges, self.graph.aging()
         allowed = edges.failures * timeout(self.choice_model.walks().steps)

@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 
+_FLAGS = ("terminated", "stuck")
 _COLUMNS = ("observation", "achieved_goal", "next_observation", "next_achieved_goal", "action", "goal")
 
 
@@ -190,9 +191,9 @@ class TransitionStore:
         self._terminated[at] = state["terminated"]
         self._stuck[at] = state["stuck"]
         self._trajectory[at] = state["trajectory"]
-        self._current = np.array(state["current"])
+        self._current = np.array(state["current"], dtype=np.int64)
         self._n_trajectories = int(state["n_trajectories"])
-        self._last_row = np.array(state["last_row"])
+        self._last_row = np.array(state["last_row"], dtype=np.int64)
 
     def _check_rows(self, state: dict[str, Any]) -> None:
         """Refuse rows and counters that do not belong together."""
@@ -202,15 +203,20 @@ class TransitionStore:
         n = min(total, self.capacity)
         shapes = {"terminated": (n,), "stuck": (n,), "trajectory": (n,), "current": (self.n_envs,)}
         for name, shape in shapes.items():
-            if np.shape(state[name]) != shape or np.asarray(state[name]).dtype.kind not in "bi":
+            if np.shape(state[name]) != shape or np.asarray(state[name]).dtype.kind != ("b" if name in _FLAGS else "i"):
                 raise ValueError(f"The stored replay buffer has no {name} of shape {shape}.")
         if any(len(state["columns"][name]) != n for name in _COLUMNS):
             raise ValueError(f"The columns of the stored replay buffer have not {n} rows each.")
         last = np.asarray(state["last_row"])
         if last.ndim != 1 or last.dtype.kind != "i" or len(last) != n_trajectories or not len(last):
             raise ValueError(f"The stored replay buffer has no last rows of {n_trajectories} trajectories.")
-        numbers = np.concatenate([state["trajectory"], state["current"]])
-        if n and not (numbers.min() >= 0 and np.asarray(state["trajectory"]).max() < len(last) and last.max() < total):
+        trajectory = np.asarray(state["trajectory"])
+        numbers = np.concatenate([trajectory, state["current"]])
+        fits = bool(numbers.min() >= 0 and numbers.max() < len(last) and last.max() < total)
+        if fits and n:
+            ahead = last[trajectory] - np.arange(total - n, total)
+            fits = bool((ahead >= 0).all() and (ahead % self.n_envs == 0).all())
+        if not fits:
             raise ValueError("The trajectories of the stored replay buffer are not those of its rows.")
 
 

@@ -8,7 +8,7 @@ Nothing is kept beside a model: parameters are torch's own memory and Adam's mom
 import itertools
 import math
 from collections.abc import Iterable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch as th
@@ -19,8 +19,10 @@ from stable_baselines3.td3.policies import Actor, TD3Policy
 from stable_baselines3.td3.td3 import TD3
 from torch import nn
 
-from sb3_skillgraph.options import kernel
 from sb3_skillgraph.options.numpy_actor import is_plain, plain_linears
+
+if TYPE_CHECKING:
+    from sb3_skillgraph.options import kernel
 
 #: Options of Adam that the kernel has not.
 ADAM_OPTIONS = ("weight_decay", "amsgrad", "maximize", "capturable", "differentiable")
@@ -34,6 +36,9 @@ class CompiledUpdate:
     """
 
     def __init__(self, policy: TD3Policy) -> None:
+        from sb3_skillgraph.options import kernel  # when it is used: it needs numba
+
+        self._kernel = kernel
         self._policy = policy
         self._n_observations = math.prod(policy.observation_space.shape or ())
         self._n_actions = math.prod(policy.action_space.shape or ())
@@ -47,23 +52,25 @@ class CompiledUpdate:
             for i, (network, target) in enumerate(zip(policy.critic.q_networks, policy.critic_target.q_networks, strict=True))
         )
         self._parameters = list(policy.parameters())
-        self._addresses = self._find_addresses()
+        self._layout = self._find_layout()
 
     def is_of(self, policy: TD3Policy) -> bool:
         """
-        Tell whether this is the update of a policy.
+        Tell whether this is the update of a policy as it is now.
 
         :param policy: the policy
-        :return: False if it was built for another one, or if a tensor lies elsewhere by now: optimisers get other ones
-            from a state dict
+        :return: False if it was built for another one, if a tensor lies elsewhere by now (optimisers get other ones from a
+            state dict), is laid out otherwise or learns no more, or if an option of Adam has changed
         """
         same_objects = policy is self._policy and _optimizers(policy) == self._optimizers
-        return same_objects and self._find_addresses() == self._addresses
+        return same_objects and self._find_layout() == self._layout
 
-    def _find_addresses(self) -> list[int]:
+    def _find_layout(self) -> list[Any]:
         states = [state for optimizer in self._optimizers for state in optimizer.state.values()]
         moments = [moment for state in states for moment in state.values()]
-        return [tensor.data_ptr() for tensor in (*self._parameters, *moments)]
+        options = [optimizer.param_groups[0].get(name) for optimizer in self._optimizers for name in ADAM_OPTIONS]
+        tensors = (*self._parameters, *moments)
+        return [*options, *((each.data_ptr(), each.stride(), each.requires_grad) for each in tensors)]
 
     def update(self, data: ReplayBufferSamples, model: TD3, penalty: float, with_actor: bool) -> tuple[float, float]:
         """
@@ -90,7 +97,7 @@ class CompiledUpdate:
         )
         tau = model.tau if with_actor else 0.0
         actor_rates, critic_rates = (_rates(optimizer, tau) for optimizer in self._optimizers)
-        return kernel.update(batch, self._actor, self._critics, actor_rates, critic_rates, float(penalty), with_actor)
+        return self._kernel.update(batch, self._actor, self._critics, actor_rates, critic_rates, float(penalty), with_actor)
 
 
 def why_not(policy: Any) -> str | None:
@@ -140,7 +147,7 @@ def _create_moments(optimizers: Iterable[th.optim.Optimizer]) -> None:
                 state["exp_avg_sq"] = th.zeros_like(parameter, memory_format=th.preserve_format)
 
 
-def _rates(optimizer: th.optim.Optimizer, tau: float) -> kernel.Rates:
+def _rates(optimizer: th.optim.Optimizer, tau: float) -> "kernel.Rates":
     group = optimizer.param_groups[0]
     beta1, beta2 = group["betas"]
     return float(group["lr"]), float(beta1), float(beta2), float(group["eps"]), float(tau)
@@ -148,12 +155,15 @@ def _rates(optimizer: th.optim.Optimizer, tau: float) -> kernel.Rates:
 
 def _arrays(
     name: str, network: nn.Module, target: nn.Module, optimizer: th.optim.Optimizer, sizes: tuple[int, int]
-) -> kernel.Arrays:
+) -> "kernel.Arrays":
     """Return the memory of a network, of its target and of its moments, if all of it is as the numbers in and out ask."""
     shapes = _shapes(network, *sizes)
     states = [optimizer.state[parameter] for parameter in network.parameters()]
+    kinds = ("exp_avg", "exp_avg_sq", "step")
+    if any(not isinstance(state.get(kind), th.Tensor) for state in states for kind in kinds):
+        raise ValueError(f"The optimiser of {name} has a parameter without one of {', '.join(kinds)}.")
     tensors = {"value": list(network.parameters()), "target": list(target.parameters())}
-    tensors |= {kind: [state[kind] for state in states] for kind in ("exp_avg", "exp_avg_sq", "step")}
+    tensors |= {kind: [state[kind] for state in states] for kind in kinds}
     return tuple(
         tuple(
             _array(f"{kind} of parameter {i} of {name}", tensor, () if kind == "step" else shape)

@@ -1,12 +1,13 @@
 """What learns an option's policy: SB3's DDPG and TD3 with one learning rate each for actor and critic, and fast."""
 
 import functools
+import importlib.util
 import math
 import sys
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import torch as th
 from stable_baselines3.common.policies import BasePolicy
@@ -18,8 +19,7 @@ from stable_baselines3.td3.td3 import TD3
 from torch import nn
 from torch.nn import functional as F
 
-if TYPE_CHECKING:
-    from sb3_skillgraph.options.compiled_update import CompiledUpdate
+from sb3_skillgraph.options.compiled_update import CompiledUpdate, why_not
 
 
 class OptionPolicy(TD3Policy):
@@ -40,7 +40,8 @@ class OptionLearner(TD3):
     Two learning rates, a penalty and a fast ``train`` for SB3's DDPG and TD3, mixed in before either.
 
     The update is written twice: in torch, to be read and for any network, and compiled, for plain networks on a CPU
-    where numba is installed (:mod:`sb3_skillgraph.options.compiled_update`). Both give the same numbers.
+    where numba is installed (:mod:`sb3_skillgraph.options.compiled_update`). Both give the same numbers but for the last
+    digits.
 
     :param policy: the policy model to use (MlpPolicy, CnnPolicy, ...)
     :param env: the environment to learn from (if registered in Gym, can be str; None builds no environment)
@@ -182,23 +183,21 @@ class OptionLearner(TD3):
     @property
     def update_path(self) -> str:
         """What updates the networks: the compiled ``"kernel"``, or ``"reference"``, torch."""
-        return "reference" if self._compiled_update() is None else "kernel"
+        return "kernel" if self._why_reference() is None else "reference"
 
-    def _compiled_update(self) -> "CompiledUpdate | None":
+    def _why_reference(self) -> str | None:
+        """Return why there is no compiled update; None where there is one."""
+        if importlib.util.find_spec("numba") is None:
+            return 'there is no numba (pip install "sb3_skillgraph[fast]")'
+        return why_not(self.policy)
+
+    def _compiled_update(self) -> CompiledUpdate | None:
         if self._compiled is not None and self._compiled.is_of(self.policy):
             return self._compiled
-        try:
-            # Not before it is needed: numba takes a while to import
-            from sb3_skillgraph.options.compiled_update import CompiledUpdate, why_not
-        except ImportError as error:
-            _warn_once(f'{error} (pip install "sb3_skillgraph[fast]")')
-            return None
-        reason = why_not(self.policy)
+        reason = self._why_reference()
         if reason is not None:
             _warn_once(reason)
-            self._compiled = None
-            return None
-        self._compiled = CompiledUpdate(self.policy)
+        self._compiled = CompiledUpdate(self.policy) if reason is None else None
         return self._compiled
 
     def __getstate__(self) -> dict[str, Any]:
@@ -213,8 +212,8 @@ class OptionDDPG(OptionLearner, DDPG):
     """
     Deep Deterministic Policy Gradient for one option, with the paper's two learning rates (Table 1).
 
-    The same numbers as ``stable_baselines3.DDPG`` (unless given a penalty), sooner where the networks are plain
-    (``benchmarks/update.py``).
+    The numbers of ``stable_baselines3.DDPG`` (unless given a penalty), sooner where the networks are plain: then they differ
+    in the last digits (``benchmarks/update.py``).
 
     :param policy: the policy model to use (MlpPolicy, CnnPolicy, ...)
     :param env: the environment to learn from (if registered in Gym, can be str; None builds no environment)
@@ -230,8 +229,8 @@ class OptionTD3(OptionLearner, TD3):
     """
     Twin Delayed DDPG for one option, with one learning rate for the actor and one for the critics.
 
-    The same numbers as ``stable_baselines3.TD3`` (unless given a penalty), sooner where the networks are plain
-    (``benchmarks/update.py``).
+    The numbers of ``stable_baselines3.TD3`` (unless given a penalty), sooner where the networks are plain: then they differ
+    in the last digits (``benchmarks/update.py``).
 
     :param policy: the policy model to use (MlpPolicy, CnnPolicy, ...)
     :param env: the environment to learn from (if registered in Gym, can be str; None builds no environment)
