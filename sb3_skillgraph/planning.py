@@ -4,7 +4,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from sb3_skillgraph.choices import EXPECTED, NO_RUNS, PESSIMISTIC, ChoiceModel, Choices, Runs, Start
+from sb3_skillgraph.choice_model import ChoiceModel
+from sb3_skillgraph.choices import EXPECTED, NO_RUNS, PESSIMISTIC, Choices, Runs, Start
 from sb3_skillgraph.edges import NOWHERE
 from sb3_skillgraph.graph import SkillGraph
 from sb3_skillgraph.walk_model import WalkModel

@@ -25,7 +25,8 @@ FLOORS: dict[str, float] = {
     "edges": 3,  # records of runs, as arrays
     "graph": 4,
     "walk_model": 5,
-    "choices": 6,
+    "choices": 5,
+    "choice_model": 6,
     "planning": 7,
     "runner": 8,
     "plan": 9,  # the runner's plans for people to read

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sb3_skillgraph.choices import ChoiceModel
+from sb3_skillgraph.choice_model import ChoiceModel
 from sb3_skillgraph.graph import SkillGraph
 from sb3_skillgraph.learning import missions as missions_module
 from sb3_skillgraph.learning.missions import MAX_FAILURES, Mission, Missions

@@ -13,20 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sb3_skillgraph import planning
-from sb3_skillgraph.choices import (
-    BESIDE,
-    EPISODE_WEIGHT,
-    EXPECTED,
-    GUESS_RUNS,
-    NEAR_EVENTS,
-    NO_RUNS,
-    OPTIMISTIC,
-    PESSIMISTIC,
-    ChoiceModel,
-    Choices,
-    Runs,
-    Start,
-)
+from sb3_skillgraph.choice_model import BESIDE, EPISODE_WEIGHT, NEAR_EVENTS, ChoiceModel
+from sb3_skillgraph.choices import EXPECTED, GUESS_RUNS, NO_RUNS, OPTIMISTIC, PESSIMISTIC, Choices, Runs, Start
 from sb3_skillgraph.edges import MAX_LANDINGS, NOWHERE
 from sb3_skillgraph.graph import SkillGraph
 from sb3_skillgraph.plan import Plan, describe

@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sb3_skillgraph.choices import EXPECTED, ChoiceModel
+from sb3_skillgraph.choice_model import ChoiceModel
+from sb3_skillgraph.choices import EXPECTED
 from sb3_skillgraph.graph import MAX_DEGREE, SkillGraph
 from sb3_skillgraph.learning.witness import FIT_EVERY, Witness
 from sb3_skillgraph.runner import Run

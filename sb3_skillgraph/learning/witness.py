@@ -5,7 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from sb3_skillgraph.choices import EXPECTED, ChoiceModel
+from sb3_skillgraph.choice_model import ChoiceModel
+from sb3_skillgraph.choices import EXPECTED
 from sb3_skillgraph.edges import NOWHERE
 from sb3_skillgraph.graph import SkillGraph
 from sb3_skillgraph.planning import DIRECT

@@ -1,0 +1,258 @@
+"""What an agent could do in each event, and what would come of it: the model that plans are made on."""
+
+import numpy as np
+
+from sb3_skillgraph.choices import GUESS_RUNS, Choices, Runs, Start
+from sb3_skillgraph.edges import NOWHERE
+from sb3_skillgraph.graph import SkillGraph
+from sb3_skillgraph.walk_model import Kind, WalkModel, timeout
+
+#: Runs that one run of the running episode counts for: it began nearest in time and place, and without noise.
+EPISODE_WEIGHT = 3.0
+#: Events nearest to a goal, or to a start, from which it is considered to walk there though nobody was seen to.
+NEAR_EVENTS = 6
+#: What a run tells of others that begin or end in the same event, in runs of their own; and of all of them, at most.
+KINSHIP, MOST_KINSHIP = 0.25, 2.0
+#: A failed run has landed far away where that is so many times further than it was to go.
+FAR = 2.0
+#: Share of the success of a walk to an event that is left for a goal beside its centre.
+BESIDE = 0.98
+
+
+class ChoiceModel:
+    """Makes choices out of the graph's records.
+
+    :param graph: the skill graph
+    :param model: what to expect of walks that have not been tried
+    """
+
+    def __init__(self, graph: SkillGraph, model: WalkModel) -> None:
+        self.graph = graph
+        self.model = model
+        self._walks: tuple[tuple[int, int], Choices] | None = None
+
+    @property
+    def version(self) -> tuple[int, int]:
+        """Changes whenever something is learned."""
+        return self.graph.version, self.model.version
+
+    # -- walks between events -----------------------------------------------------------------------------------------
+
+    def walks(self) -> Choices:
+        """Return what training has shown of each edge, in the order of the graph's edges (not to be changed)."""
+        if self._walks is None or self._walks[0] != self.version:
+            self._walks = self.version, self._gather()
+        return self._walks[1]
+
+    def kinds(self) -> Kind:
+        """Return what is known of the graph's walks beside their runs."""
+        graph, edges = self.graph, self.graph.edges
+        offsets = graph.centers[edges.target] - graph.centers[edges.source]
+        distance = np.linalg.norm(offsets, axis=1) / graph.radius
+        return Kind(distance, edges.crossing_steps, edges.forward, edges.backward)
+
+    def _gather(self) -> Choices:
+        edges, aging, kinds = self.graph.edges, self.graph.aging(), self.kinds()
+        successes, failures = edges.successes * aging, edges.failures * aging
+        hasty = self.model.is_hasty(kinds)
+        guess = self._with_kin(self.model.success(kinds), hasty, successes, successes + failures)
+        # A guess of the steps counts for one run.
+        steps = (self.model.steps(kinds) + edges.success_steps * aging) / (1.0 + successes)
+        failed_steps = (self.model.patience * timeout(steps) + edges.failure_steps * aging) / (1.0 + failures)
+        failed_steps = np.minimum(failed_steps, timeout(steps))  # it may have been allowed more when it was slower
+        loss = self._with_kin(self._loss(kinds), hasty, self.far_failures(kinds), failures)
+        weight = edges.landing_weight * aging[:, None]
+        times = (steps, failed_steps)
+        return Choices(edges.source, edges.target, guess, successes, failures, *times, loss, edges.landing, weight)
+
+    def _loss(self, kinds: Kind) -> np.ndarray:
+        return np.where(self.model.is_hasty(kinds), self.model.loss[0], self.model.loss[1])
+
+    def _with_kin(self, guess: np.ndarray, hasty: np.ndarray, hits: np.ndarray, runs: np.ndarray) -> np.ndarray:
+        """Return a guessed share, corrected by the runs of its kin: edges out of the same event, and into the same one.
+
+        :param guess: shape ``(n_edges,)``
+        :param hasty: which edges are hasty: those and others are no kin
+        :param hits: weight of the runs of each edge of which the share is guessed
+        :param runs: weight of all of its runs
+        """
+        edges, n_events = self.graph.edges, len(self.graph.events)
+        total, weight = GUESS_RUNS * guess, np.full(len(guess), GUESS_RUNS)
+        for ends in (edges.source + n_events * hasty, edges.target + n_events * hasty):
+            kin_hits = np.bincount(ends, hits, 2 * n_events)[ends] - hits
+            kin_runs = np.bincount(ends, runs, 2 * n_events)[ends] - runs
+            scale = np.minimum(KINSHIP, MOST_KINSHIP / np.maximum(kin_runs, 1e-9))
+            total += scale * kin_hits
+            weight += scale * kin_runs
+        return np.clip(total / weight, 0.0, 1.0)
+
+    def far_failures(self, kinds: Kind) -> np.ndarray:
+        """Return the weight of the failed runs of each edge that landed far away or nowhere, shape ``(n_edges,)``.
+
+        :param kinds: of the edges
+        """
+        graph, edges = self.graph, self.graph.edges
+        rows = np.flatnonzero(edges.failures > 0.0)
+        # With one entry more than there are events: NOWHERE is infinitely far away.
+        centers = np.concatenate([graph.centers, np.full((1, graph.goal_dim), np.inf)])
+        away = np.linalg.norm(centers[edges.landing[rows]] - graph.centers[edges.source[rows]][:, None], axis=2)
+        far = away > FAR * (kinds.distance[rows, None] + 1.0) * graph.radius
+        result = np.zeros(edges.size)
+        result[rows] = (edges.landing_weight[rows] * far).sum(axis=1) * graph.aging()[rows]
+        return result
+
+    # -- what an episode adds -----------------------------------------------------------------------------------------
+
+    def of_episode(self, start: Start, goal: np.ndarray, runs: Runs, everywhere: bool = False) -> tuple[np.ndarray, Choices]:
+        """Return what can be done beside what training has shown.
+
+        :param start: where the agent stands
+        :param goal: shape ``(goal_dim,)``
+        :param runs: what has happened in this episode
+        :param everywhere: whether walks straight to the goal are considered from all events, however far away
+        :return: edges that the episode has shown more of, and the choices that take their place or come on top: those, the
+            walks to the goal, and last what can be done at the start
+        """
+        replaced, tried = self._tried(runs)
+        to_goal = self._to_goal(replaced, tried, goal, runs, everywhere)
+        return replaced, Choices.join([tried, to_goal, self._at_start(replaced, tried, to_goal, start, goal, runs)])
+
+    def _tried(self, runs: Runs) -> tuple[np.ndarray, Choices]:
+        """Return the edges that the episode has runs of, and what is known of them with those."""
+        found = (self.graph.edges.find(u, v) for u, v in zip(runs.source.tolist(), runs.target.tolist(), strict=True))
+        replaced = np.unique(np.array([row for row in found if row is not None], dtype=np.int64))
+        tried = self.walks().take(replaced)
+        for i, (source, target) in enumerate(zip(tried.source.tolist(), tried.target.tolist(), strict=True)):
+            for success, landing, number in runs.of(source, target):
+                tried.add_runs(i, success, landing, EPISODE_WEIGHT * number)
+        return replaced, tried
+
+    def _edges(self, chosen: np.ndarray, replaced: np.ndarray, tried: Choices) -> Choices:
+        """Return some of the graph's edges, with what the episode has shown of them."""
+        rows = np.flatnonzero(chosen)
+        return Choices.join([self.walks().take(rows[~np.isin(rows, replaced)]), tried.take(chosen[replaced])])
+
+    def _to_goal(self, replaced: np.ndarray, tried: Choices, goal: np.ndarray, runs: Runs, everywhere: bool) -> Choices:
+        """Return the walks to the goal itself, from events.
+
+        Where the goal belongs to an event, whoever can walk to that can walk to the goal as well. From there itself, and from
+        the events nearest to the goal if they have no such walk, it is a guess; a walk that would be longer than any in the
+        graph is considered only where there is no shorter one.
+        """
+        graph, vertex = self.graph, len(self.graph.events)
+        distance = graph.distances(goal)
+        home = graph.locate(goal)
+        near = np.argsort(distance, kind="stable")
+        if not everywhere:
+            near = near[:NEAR_EVENTS]
+        if home == NOWHERE:
+            guessed = self._guessed(near, near, vertex, distance[near], np.zeros(len(near)), runs)
+            return guessed if everywhere else self._short(guessed, least=1)
+        beside = self._beside(self._edges(graph.edges.target == home, replaced, tried), home, distance, runs)
+        near = near[~np.isin(near, beside.source)]
+        seen = (near == home).astype(np.float64)  # somebody was near the goal, in its event
+        guessed = self._guessed(near, near, vertex, distance[near], seen, runs)
+        if not everywhere:
+            guessed = self._short(guessed, least=0 if len(beside.source) else 1)
+        return Choices.join([guessed, beside])
+
+    def _short(self, guessed: Choices, least: int) -> Choices:
+        """Return the guessed walks that are no longer than those of the graph.
+
+        :param guessed: walks to the goal
+        :param least: how many to keep, however long they are: the shortest
+        """
+        rank = np.argsort(np.argsort(guessed.steps, kind="stable"), kind="stable")
+        return guessed.take(np.flatnonzero((guessed.steps <= self.graph.walk_steps) | (rank < least)))
+
+    def _beside(self, walks: Choices, home: int, distance: np.ndarray, runs: Runs) -> Choices:
+        """Return walks to the goal for the walks to its event.
+
+        :param walks: to the event
+        :param home: index of the event
+        :param distance: of all events from the goal, in goal units
+        :param runs: of the episode
+        """
+        vertex, centers = len(self.graph.events), self.graph.centers
+        between = np.maximum(np.linalg.norm(centers[walks.source] - centers[home], axis=1), 1e-9)
+        stretch = np.clip(distance[walks.source] / between, 0.5, 2.0)
+        beside = walks._replace(
+            target=np.full(len(walks.target), vertex),
+            guess=BESIDE * walks.guess,
+            successes=BESIDE * walks.successes,
+            steps=stretch * walks.steps,
+            failed_steps=stretch * walks.failed_steps,
+        )
+        for i, source in enumerate(beside.source.tolist()):
+            for success, where, number in runs.of(source, vertex):
+                beside.add_runs(i, success, where, EPISODE_WEIGHT * number)
+        return beside
+
+    def _guessed(
+        self,
+        source: np.ndarray,
+        event: np.ndarray,
+        target: int | np.ndarray,
+        distance: np.ndarray,
+        seen: np.ndarray,
+        runs: Runs,
+    ) -> Choices:
+        """Return walks that no edge stands for, by their distance and what the episode has shown.
+
+        :param source: vertices where they begin, shape ``(n,)``
+        :param event: events that runs of them are recorded for
+        :param target: vertices where they lead
+        :param distance: in goal units
+        :param seen: 1 where somebody has been near the target, 0 elsewhere
+        :param runs: of the episode
+        """
+        n, radii = len(source), distance / self.graph.radius
+        kind = Kind(radii, seen * self.model.steps_per_radius * radii, seen, np.zeros(n))
+        landing = np.full((n, self.graph.edges.landing.shape[1]), NOWHERE)
+        targets = np.broadcast_to(np.asarray(target), (n,)).copy()
+        zeros, steps = (np.zeros(n), np.zeros(n)), self.model.steps(kind)
+        guessed = Choices(
+            source,
+            targets,
+            self.model.success(kind),
+            *zeros,
+            steps,
+            self.model.patience * timeout(steps),
+            self._loss(kind),
+            landing,
+            np.zeros(landing.shape),
+        )
+        for i, (begin, end) in enumerate(zip(event.tolist(), targets.tolist(), strict=True)):
+            for success, where, number in runs.of(begin, end):
+                guessed.add_runs(i, success, where, EPISODE_WEIGHT * number)
+        return guessed
+
+    def _at_start(
+        self, replaced: np.ndarray, tried: Choices, to_goal: Choices, start: Start, goal: np.ndarray, runs: Runs
+    ) -> Choices:
+        """Return what can be done at the start: what can be done in its event, and walks that can be tried."""
+        graph, n_events = self.graph, len(self.graph.events)
+        here, distances = np.array([n_events + 1]), graph.distances(start.point)
+        event = np.array([start.event])
+        parts = []
+        if start.event != NOWHERE:
+            parts += [self._edges(graph.edges.source == start.event, replaced, tried)]
+            parts += [to_goal.take(to_goal.source == start.event)]
+            if distances[start.event] > graph.radius:
+                # At the edge of its event: to walk to the middle first may help.
+                parts.append(self._guessed(here, event, start.event, distances[event], np.ones(1), runs))
+        else:
+            near = np.argsort(distances, kind="stable")[:NEAR_EVENTS]
+            nowhere = np.full(len(near), NOWHERE)
+            parts.append(self._guessed(near, nowhere, near, distances[near], np.zeros(len(near)), runs))
+        targets = np.concatenate([part.target for part in parts])
+        if n_events not in targets:
+            distance = np.array([np.linalg.norm(goal - start.point)])
+            direct = self._guessed(here, event, n_events, distance, np.zeros(1), runs)
+            # One that would be longer than any walk in the graph is begun only where there is nothing else to do.
+            if direct.steps[0] <= graph.walk_steps or not len(targets) or start.towards == n_events:
+                parts.append(direct)
+        if start.towards not in (NOWHERE, n_events) and start.towards not in targets:
+            parts.append(self._guessed(here, event, start.towards, distances[[start.towards]], np.ones(1), runs))
+        choices = Choices.join(parts)
+        return choices._replace(source=np.full(len(choices.source), n_events + 1))
