@@ -23,7 +23,7 @@ from joblib import Parallel, delayed
 from benchmarks.zero_shot import summary
 from sb3_skillgraph import SkillGraphAgent, __version__
 from sb3_skillgraph.envs import MazeGeometry, MazeMap
-from sb3_skillgraph.evaluation import run_pair
+from sb3_skillgraph.evaluation import Predictor, run_pair
 
 ENV = "SkillGraph/PointMaze-v0"
 DOOR = (4, 4)
@@ -67,7 +67,7 @@ class Halves:
                 return start, goal
 
 
-def success(agent: SkillGraphAgent, env: gym.Env, pairs: list[tuple[np.ndarray, np.ndarray]]) -> float:
+def success(agent: Predictor, env: gym.Env, pairs: list[tuple[np.ndarray, np.ndarray]]) -> float:
     """Return the share of pairs of start and goal between which the agent finds its way."""
     return float(np.mean([run_pair(agent, env, start, goal, np.nan).success for start, goal in pairs]))
 

@@ -24,9 +24,10 @@ import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 
+from benchmarks.few_shot import success
 from sb3_skillgraph import SkillGraphAgent, __version__
 from sb3_skillgraph.baselines import make_her
-from sb3_skillgraph.evaluation import Predictor, run_pair, sample_pairs
+from sb3_skillgraph.evaluation import Predictor, sample_pairs
 from sb3_skillgraph.hyperparams import load_hyperparams
 
 ENOUGH = 0.95
@@ -68,10 +69,10 @@ class StopAt(BaseCallback):
         return time.perf_counter() < self.end
 
 
-def success(agent: Predictor, env: gym.Env, pairs: list[tuple[np.ndarray, np.ndarray]]) -> float:
-    """Return the share of pairs of start and goal between which an agent finds its way."""
+def tested(agent: Predictor, env: gym.Env, pairs: list[tuple[np.ndarray, np.ndarray]]) -> float:
+    """Return an agent's success on pairs of start and goal; chance, where an environment has any, is the same each time."""
     env.reset(seed=0)
-    return float(np.mean([run_pair(agent, env, start, goal, np.nan).success for start, goal in pairs]))
+    return success(agent, env, pairs)
 
 
 def learn(task: Task, seed: int, pairs: list[tuple[np.ndarray, np.ndarray]], env: gym.Env) -> dict[str, Any]:
@@ -93,7 +94,7 @@ def learn(task: Task, seed: int, pairs: list[tuple[np.ndarray, np.ndarray]], env
         begin = time.perf_counter()
         agent.learn(n_steps - agent.num_timesteps, reset_num_timesteps=False, log_interval=None)
         seconds += time.perf_counter() - begin
-        curve.append((n_steps, round(seconds, 1), success(agent, env, pairs)))
+        curve.append((n_steps, round(seconds, 1), tested(agent, env, pairs)))
         if len(curve) > 1 and min(curve[-1][2], curve[-2][2]) >= ENOUGH:
             return {"seconds": curve[-2][1], "steps": curve[-2][0], "curve": curve}
     return {"seconds": None, "steps": None, "curve": curve}
@@ -123,7 +124,7 @@ def run_seed(name: str, seed: int, n_pairs: int, cache: str) -> dict[str, Any]:
     pairs = [(start, goal) for start, goal, _ in drawn]
     run = {"seed": seed, **learn(task, seed, pairs, env)}
     if run["seconds"] is not None:
-        run["her"] = success(hindsight(task, seed, run["seconds"]), env, pairs)
+        run["her"] = tested(hindsight(task, seed, run["seconds"]), env, pairs)
     return run
 
 

@@ -19,8 +19,8 @@ from sb3_skillgraph.walk_model import timeout
 MAX_RUNS = 256
 ID = "U16"  # NumPy's type of ids
 #: An agent stands still if nothing that it sees changes, in so many steps in a row, by more than this share of what it changes
-#: by when the agent moves: what a policy without noise does there it will do for ever. (Five agents with
-#: dead spots reached .74 of their goals with 8 steps, .69 with 5, .65 without.)
+#: by when the agent moves: what a policy without noise does there it will do for ever. (Five agents with dead spots reached
+#: .74 of their goals with 8 steps, .69 with 5, .65 without.)
 STILL_STEPS, STILL = 8, 0.01
 #: A pace grows by this factor in a step at most, and shrinks by that one: a single jump, into a teleporter say, is no pace.
 FASTER, SLOWER = 2.0, 0.99

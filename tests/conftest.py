@@ -224,3 +224,12 @@ def trained(trained_files: tuple[Path, Path]) -> Iterator[SkillGraphAgent]:
     agent.load_replay_buffer(trained_files[1])
     yield agent
     env.close()
+
+
+@pytest.fixture
+def one_thread() -> Iterator[None]:
+    """Torch on one thread, whatever it had: sums then come out the same to the bit."""
+    threads = th.get_num_threads()
+    th.set_num_threads(1)
+    yield
+    th.set_num_threads(threads)

@@ -12,13 +12,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from sb3_skillgraph.options import kernel
 from sb3_skillgraph.options.learner import OptionDDPG, OptionTD3
 
-
-@pytest.fixture(autouse=True)
-def one_thread():
-    threads = th.get_num_threads()
-    th.set_num_threads(1)
-    yield
-    th.set_num_threads(threads)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def twins(cls, net_arch, **kwargs):

@@ -17,13 +17,7 @@ from sb3_skillgraph.options import learner as learner_module
 from sb3_skillgraph.options.learner import OptionDDPG, OptionTD3
 from sb3_skillgraph.options.numpy_actor import NumpyActor, is_vector_space
 
-
-@pytest.fixture(autouse=True)
-def one_thread():
-    threads = th.get_num_threads()
-    th.set_num_threads(1)
-    yield
-    th.set_num_threads(threads)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def stock_twin(model, cls):

@@ -225,6 +225,8 @@ class _CornerGraph:
     def __init__(
         self, is_wall: list[list[bool]], extent: tuple[float, float, float, float], cell_size: float, margin: float
     ) -> None:
+        from scipy.sparse.csgraph import shortest_path  # when it is used: it takes a while to import
+
         walls = np.array(is_wall)
         hair, width = _HAIR * cell_size, margin / math.sqrt(2)
         self._origin = np.array([extent[0], extent[3]])
@@ -240,8 +242,6 @@ class _CornerGraph:
         self._low = np.concatenate([box.min(axis=1) - by for box, by in grown])
         self._high = np.concatenate([box.max(axis=1) + by for box, by in grown])
         lengths = np.array([self._visible_distances(corner) for corner in self._corners]).reshape(2 * (len(corners),))
-        from scipy.sparse.csgraph import shortest_path  # when it is used: it takes a while to import
-
         self._between = shortest_path(np.where(np.isfinite(lengths), lengths, 0.0), directed=False)
 
     def _to_xy(self, column_row: NDArray[np.int64]) -> NDArray[np.float64]:

@@ -130,12 +130,16 @@ class Missions:
         if mission.exploring:
             mission.explore_steps -= 1
             return mission.explore_steps <= 0
-        arrived = math.dist(point.tolist(), mission.goal.tolist()) <= self.graph.radius
+        arrived = self._is_at(point, mission.goal)
         if not arrived and mission.n_failures >= MAX_FAILURES:
             # Who cannot travel yet explores where it is: standing before a wall teaches nothing.
             mission.beyond, mission.explore_steps, arrived = None, self.exploration_steps, True
         mission.exploring = arrived and mission.explore_steps > 0
         return arrived and not mission.exploring
+
+    def _is_at(self, point: np.ndarray, goal: np.ndarray) -> bool:
+        """Tell whether who stands at a point has reached a goal."""
+        return math.dist(point.tolist(), goal.tolist()) <= self.graph.radius
 
     # -- choosing -----------------------------------------------------------------------------------------------------
 
@@ -176,7 +180,7 @@ class Missions:
 
     def _adapt(self, point: np.ndarray, goal: np.ndarray) -> Mission:
         """Pursue the goal that adaptation is for; look for a way to it while nobody has been there (section 3.3)."""
-        if math.dist(point.tolist(), goal.tolist()) <= self.graph.radius:
+        if self._is_at(point, goal):
             return self._travel()  # to come back from somewhere else
         if self.graph.locate(goal) == NOWHERE and self.rng.random() < LOOK_FOR_A_WAY:
             return self._look_for(goal)
