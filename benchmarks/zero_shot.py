@@ -3,9 +3,9 @@
     python -m benchmarks.zero_shot --env SkillGraph/PointMazeMedium-v0 --checks 5000 10000 20000 \
         --out benchmarks/results/zero_shot_medium.json
 
-Each seed trains an agent and tests it on 100 pairs after each number of steps; at the end the same walker goes straight on
-to the same goals. The file holds every seed as it came out, means with standard errors and 95 % t intervals over seeds, and
-the promises of all plans beside what happened.
+Each seed trains an agent, as ``hyperparams/skillgraph.yml`` recommends, and tests it on 100 pairs after each number of
+steps; at the end the same walker goes straight on to the same goals. The file holds every seed as it came out, means with
+standard errors and 95 % t intervals over seeds, and the promises of all plans beside what happened.
 """
 
 import argparse
@@ -25,6 +25,7 @@ from scipy import stats
 from sb3_skillgraph import SkillGraphAgent, __version__, evaluate_pairs
 from sb3_skillgraph.baselines import StraightOn
 from sb3_skillgraph.evaluation import PairsResult, brier_score, calibration
+from sb3_skillgraph.hyperparams import load_hyperparams
 
 
 def run_seed(args: argparse.Namespace, seed: int) -> dict[str, Any]:
@@ -36,7 +37,9 @@ def run_seed(args: argparse.Namespace, seed: int) -> dict[str, Any]:
     """
     th.set_num_threads(1)
     env = gym.make(args.env, **args.env_kwargs)
-    agent = SkillGraphAgent("MultiInputPolicy", env, seed=seed, **args.arguments)
+    settings = {**load_hyperparams(args.env), **args.arguments}
+    del settings["n_timesteps"]
+    agent = SkillGraphAgent(env=env, seed=seed, **settings)
     checks = []
     for n_steps in args.checks:
         begin = time.perf_counter()
@@ -50,7 +53,7 @@ def run_seed(args: argparse.Namespace, seed: int) -> dict[str, Any]:
 
 
 def described(result: PairsResult) -> dict[str, Any]:
-    """Return what is kept of a test: rates, and of each pair its success, its steps and what was promised."""
+    """Return what is kept of a test: rates, the episodes in which the agent fell, and each pair's success, steps, promise."""
     steps = [pair.steps for pair in result.pairs if pair.success]
     long_direct = sum(trace.direct_steps for trace in result.traces) / sum(pair.steps for pair in result.pairs)
     return {
@@ -58,6 +61,7 @@ def described(result: PairsResult) -> dict[str, Any]:
         "mean_steps": round(float(np.mean(steps)), 1) if steps else None,
         "walk_success_rate": round(result.option_success_rate, 3),
         "direct_share": round(long_direct, 3),
+        "fell": sum(pair.stuck for pair in result.pairs),
         "pairs": [[int(pair.success), pair.steps, round(pair.trace.promised, 3)] for pair in result.pairs if pair.trace],
     }
 
