@@ -4,8 +4,9 @@
 
 *Visited*: an agent on the toy environment whose store holds so many transitions; a learning step (mean over whole runs of
 ``learn``, growth and updates included), a ``predict`` while an option runs, and a decision (a plan for a new goal).
-*Events*: a graph laid by hand over an open square, each event joined to the events around it; a decision, and ``plan``, which
-works out what it promises as well. Medians over turns; the machine's own noise is in them.
+*Events*: a graph laid by hand over an open square, each event joined to the events around it; the mask of ``OptionsEnv`` (an
+action for every walk), a decision, and ``plan``, which works out what it promises as well. Medians over turns; the machine's
+own noise is in them.
 """
 
 import argparse
@@ -23,6 +24,8 @@ from sb3_skillgraph import SkillGraphAgent
 from sb3_skillgraph.choices import Start
 from sb3_skillgraph.graph import MAX_DEGREE, SPACING, SkillGraph
 from sb3_skillgraph.planning import Planner
+from sb3_skillgraph.runner import Runner
+from sb3_skillgraph.smdp.actions import WalkActions
 from sb3_skillgraph.walk_model import WalkModel
 
 TOY = "SkillGraph/ToyMaze-v0"
@@ -101,8 +104,15 @@ def with_events(n_events: int) -> dict[str, float]:
         planner.path(solution, solution.first())
         planner.promise(solution, solution.first(), 1_000.0)
 
+    runner = SkillGraphAgent("MultiInputPolicy", gym.make(TOY)).parts.runner
+    actions = WalkActions(Runner(planner.graph, planner, runner.actor, runner.view))
+
+    def mask(i: int) -> None:
+        here, goal = points[i].astype(np.float32)
+        actions.masks({"observation": here, "achieved_goal": here, "desired_goal": goal})
+
     times = max(3, 2_000 // n_events)
-    result = {"events": n_events, "edges": planner.graph.edges.size}
+    result = {"events": n_events, "edges": planner.graph.edges.size, "mask_ms": milliseconds(mask, 200)}
     return {**result, "decision_ms": milliseconds(decide, times), "plan_ms": milliseconds(plan, max(times // 4, 1))}
 
 

@@ -196,8 +196,8 @@ class SkillGraphAgent(OffPolicyAlgorithm):
     @property
     def options(self) -> list[Walk]:
         """All options of the graph: the walks, one to each event. They share their SB3 model, ``option.learner``."""
-        learner = self.parts.walker.learner
-        return [Walk(id, event, learner) for id, event in zip(self.graph.walk_ids, self.graph.events, strict=True)]
+        learner, runner = self.parts.walker.learner, self.parts.runner
+        return [Walk(id, event, learner, runner) for id, event in zip(self.graph.walk_ids, self.graph.events, strict=True)]
 
     @property
     def event_radius(self) -> float:

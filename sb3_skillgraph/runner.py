@@ -1,13 +1,13 @@
 """Running options, one environment step at a time: the same in ``learn`` and in ``predict`` (sections 3.2.4, A.6)."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
-from sb3_skillgraph.choices import EXPECTED, OPTIMISTIC, PESSIMISTIC, Runs, Start
+from sb3_skillgraph.choices import EXPECTED, OPTIMISTIC, PESSIMISTIC, Choices, Runs, Start
 from sb3_skillgraph.edges import NOWHERE
 from sb3_skillgraph.graph import SkillGraph
 from sb3_skillgraph.options.numpy_actor import NumpyActor
@@ -117,6 +117,25 @@ class Run:
     stood_still: bool = False
 
 
+class Chosen(NamedTuple):
+    """An option that is to begin.
+
+    :param option: its id
+    :param event: id of the event it begins in, empty if in none
+    :param aim: where it walks to, shape ``(goal_dim,)``
+    :param timeout: environment steps it may run
+    """
+
+    option: str
+    event: str
+    aim: np.ndarray
+    timeout: float
+
+
+#: Chooses an option, given the state, the environment, where the agent stands, the goal and the stance.
+Chooser = Callable[[RunnerState, int, np.ndarray, np.ndarray, float], Chosen]
+
+
 class Runner:
     """Lets the first option of the plan run, and plans anew when it has ended.
 
@@ -194,7 +213,12 @@ class Runner:
         state.run_count[i, slot] += 1
 
     def act(
-        self, observation: dict[str, np.ndarray], goals: np.ndarray, state: RunnerState, stance: float = PESSIMISTIC
+        self,
+        observation: dict[str, np.ndarray],
+        goals: np.ndarray,
+        state: RunnerState,
+        stance: float = PESSIMISTIC,
+        choose: Chooser | None = None,
     ) -> tuple[np.ndarray, RunnerState]:
         """Begin an option where none is running, and let the options act.
 
@@ -202,6 +226,7 @@ class Runner:
         :param goals: where the agents are to go, shape ``(n_envs, goal_dim)``
         :param state: the state before the step
         :param stance: what plans count on
+        :param choose: chooses an option; by default :meth:`choose`
         :return: actions scaled to [-1, 1], shape ``(n_envs, action_dim)``, and the state after the step
         """
         points = observation["achieved_goal"]
@@ -210,8 +235,9 @@ class Runner:
         if idle:
             state = state.copy()
         for i in idle:
-            start = self.start(state, i, points[i])
-            self.begin(state, i, self.decide(state, i, start, goals[i], stance), start, goals[i])
+            chosen = (choose or self.choose)(state, i, points[i], goals[i], stance)
+            state.option[i], state.began[i], state.aim[i], state.timeout[i] = chosen
+            state.steps[i] = state.still[i] = 0
         actions = self.actor.act(self.view(observation["observation"], points, state.aim))
         return actions, state._replace(steps=state.steps + 1, elapsed=state.elapsed + 1)
 
@@ -254,17 +280,42 @@ class Runner:
                 break
         return solution
 
-    def begin(self, state: RunnerState, i: int, solution: Solution, start: Start, goal: np.ndarray) -> None:
-        """Begin the first option of a plan, in place."""
-        first = solution.first()
-        target = int(solution.episode.target[first])
-        if target == solution.goal:
-            state.option[i], state.aim[i] = DIRECT, goal
-        else:
-            state.option[i], state.aim[i] = self.graph.walk_ids[target], self.graph.centers[target]
-        state.began[i] = self.graph.id(start.event)
-        state.steps[i], state.timeout[i] = 0, timeout(float(solution.episode.steps[first]))
-        state.still[i] = 0
+    def choose(self, state: RunnerState, i: int, point: np.ndarray, goal: np.ndarray, stance: float) -> Chosen:
+        """Choose the first option of the plan.
+
+        :param state: the state before the step
+        :param i: the environment
+        :param point: where its agent stands, shape ``(goal_dim,)``
+        :param goal: where it is to go, same shape
+        :param stance: what the plan counts on
+        """
+        start = self.start(state, i, point)
+        solution = self.decide(state, i, start, goal, stance)
+        return self.option_of(solution.episode, solution.first(), start, goal)
+
+    def option_of(self, choices: Choices, row: int, start: Start, goal: np.ndarray) -> Chosen:
+        """Return the option that a choice stands for.
+
+        :param choices: what can be done
+        :param row: which of them
+        :param start: where
+        :param goal: shape ``(goal_dim,)``
+        """
+        graph, target = self.graph, int(choices.target[row])
+        option, aim = (DIRECT, goal) if target == len(graph.events) else (graph.walk_ids[target], graph.centers[target])
+        return Chosen(option, graph.id(start.event), aim, timeout(float(choices.steps[row])))
+
+    def choices(self, state: RunnerState, i: int, point: np.ndarray, goal: np.ndarray) -> Choices:
+        """Return what can be begun in one environment: the walk straight to the goal, and walks to events.
+
+        :param state: the state before the step; no option runs
+        :param i: the environment
+        :param point: where its agent stands, shape ``(goal_dim,)``
+        :param goal: shape ``(goal_dim,)``
+        """
+        start = self.start(state, i, point)._replace(towards=len(self.graph.events))
+        _, choices = self.planner.choice_model.of_episode(start, goal.astype(np.float64), self.runs(state, i))
+        return choices.take(np.flatnonzero(choices.source == len(self.graph.events) + 1))
 
     def runs(self, state: RunnerState, i: int) -> Runs:
         """Return the episode's runs of one environment as the planner takes them; those of forgotten events are left out."""

@@ -21,11 +21,10 @@ from sb3_skillgraph import OptionsEnv, SkillGraphAgent, SMDPQLearning
 from sb3_skillgraph.events import Event
 from sb3_skillgraph.memory.store import TransitionStore
 from sb3_skillgraph.options.option import Option
-from sb3_skillgraph.smdp import FlatPolicy
+from sb3_skillgraph.smdp import FlatPolicy, GraphPolicy
 
 GAMMA = 0.9
 RADIUS = 0.45
-rests = pytest.mark.skip(reason="rests until skills are built on the graph of walks")
 
 
 class Towards:
@@ -180,26 +179,13 @@ def test_one_step_of_the_global_policy_where_actions_have_many_dimensions(option
     assert info["tau"] == 1
 
 
-def test_the_global_option_walks_to_the_goal_or_along_a_route(options: list[Option], walker: Option) -> None:
+def test_the_global_option_walks_to_the_goal(options: list[Option], walker: Option) -> None:
     env = lifted(options, walker)
     env.reset(options={"start": [-1.0, 1.0], "goal": [-1.0, 1.0 - 0.3]})
     _, reward, terminated, _, info = env.step(env.first_fixed)
     assert terminated
     assert info["option_success"]
     assert (info["tau"], reward) == (1, 1.0)
-    asked = []
-
-    def route(point: np.ndarray, goal: np.ndarray) -> np.ndarray:
-        asked.append((point.tolist(), goal.tolist()))
-        return np.array([0.0, 1.0])
-
-    env = lifted(options, walker, route=route)
-    env.reset(options={"start": [-1.0, 1.0], "goal": [1.0, -1.0]})
-    observation, _, _, _, info = env.step(env.first_fixed)
-    assert asked == [([-1.0, 1.0], [1.0, -1.0])]
-    assert info["tau"] <= env.timeout // 2
-    if info["option_success"]:
-        assert np.linalg.norm(observation["achieved_goal"] - [0.0, 1.0]) <= 0.5 * RADIUS
 
 
 def test_what_it_refuses(options: list[Option], walker: Option) -> None:
@@ -215,15 +201,9 @@ def test_what_it_refuses(options: list[Option], walker: Option) -> None:
         OptionsEnv(gym.make(TOY), many).global_action  # noqa: B018
 
 
-def test_the_global_option_may_be_among_the_options_or_missing(options: list[Option], walker: Option) -> None:
-    goal = {"start": [-1.0, 1.0], "goal": [-1.0, 0.7]}
-    listed = OptionsEnv(gym.make(TOY), [walker, *options])
-    listed.reset(options=goal)
-    assert (listed.global_action, listed.first_fixed) == (0, 59)
-    assert listed.action_masks()[0]
-    assert listed.step(0)[-1]["option"] == "global"
+def test_the_global_option_may_be_missing(options: list[Option]) -> None:
     without = OptionsEnv(gym.make(TOY), list(options))
-    without.reset(options=goal)
+    without.reset(options={"start": [-1.0, 1.0], "goal": [-1.0, 0.7]})
     assert without.action_masks()[-5:].all()
     assert without.first_fixed == 59
 
@@ -260,7 +240,6 @@ def test_monitor_counts_decisions_and_seeds_repeat(options: list[Option], walker
 # -- high levels ------------------------------------------------------------------------------------------------------
 
 
-@rests
 def test_the_options_of_an_agent_are_actions(trained: SkillGraphAgent) -> None:
     env = OptionsEnv(gym.make(TOY, terminate_on_success=True, max_steps=200), trained.options, gamma=GAMMA)
     rng, ran = np.random.default_rng(0), set()
@@ -274,11 +253,8 @@ def test_the_options_of_an_agent_are_actions(trained: SkillGraphAgent) -> None:
     assert ran & {option.id for option in trained.options}
 
 
-@rests
 def test_the_graph_plans_on_it(trained: SkillGraphAgent) -> None:
     """``GraphPolicy`` runs on an ``OptionsEnv`` the options that ``predict`` would run."""
-    from sb3_skillgraph.smdp import GraphPolicy  # type: ignore[attr-defined]
-
     base = gym.make(TOY, terminate_on_success=True, max_steps=200)
     env, rng = OptionsEnv(gym.make(TOY, terminate_on_success=True, max_steps=200), trained.options), np.random.default_rng(0)
     policy = GraphPolicy(trained, env)
@@ -297,6 +273,57 @@ def test_the_graph_plans_on_it(trained: SkillGraphAgent) -> None:
                 observation = base.step(move)[0]
             over = terminated or truncated
             np.testing.assert_array_equal(observation["achieved_goal"], lifted_observation["achieved_goal"])
+
+
+def test_walks_keep_their_actions_when_events_are_merged(trained: SkillGraphAgent) -> None:
+    env = OptionsEnv(gym.make(TOY), trained.options)
+    before = [env.index(option.id) for option in trained.options]
+    assert before == list(range(len(before)))
+    assert env.max_options == trained.graph.max_events + 6  # the walk straight to the goal, and five primitives
+    kept = {option.id: env.index(option.id) for option in trained.options}
+    trained.graph.coarsen()
+    new = trained.graph.add_event(np.array([5.0, 5.0]), salient=True)
+    env.reset(seed=0, options={"start": [-1.0, 1.0], "goal": [1.0, -1.0]})
+    assert all(env.index(option.id) == kept.get(option.id, len(before)) for option in trained.options)
+    assert env.index(trained.graph.walk_ids[new]) == len(before)
+    gone = [action for id, action in kept.items() if trained.graph.index(id) < 0]
+    assert gone
+    assert not env.action_masks()[gone].any()
+    with pytest.raises(KeyError):
+        env.index("w999")
+
+
+def test_a_walk_can_be_taken_where_the_graph_has_an_edge_to_it(trained: SkillGraphAgent) -> None:
+    env, graph = OptionsEnv(gym.make(TOY), trained.options), trained.graph
+    for i, event in enumerate(trained.events):
+        env.reset(options={"start": event.center, "goal": [1.0, -1.0]})
+        there = {graph.walk_ids[target] for target in graph.edges.target[graph.edges.source == i].tolist()}
+        assert there == {trained.options[action].id for action in np.flatnonzero(env.action_masks()[: len(trained.events)])}
+        assert env.action_masks()[env.first_fixed :].all()
+
+
+def test_a_stuck_walk_ends_the_episode(trained: SkillGraphAgent) -> None:
+    class Trap(gym.Wrapper):
+        """Catches at once."""
+
+        def step(self, action: Any) -> Any:
+            return (*self.env.step(action)[:-1], {"stuck": True, "is_success": False})
+
+    env = OptionsEnv(Trap(gym.make(TOY)), trained.options, gamma=GAMMA)
+    for action in (env.global_action, env.first_fixed + 1):
+        env.reset(options={"start": [-1.0, 1.0], "goal": [1.0, -1.0]})
+        _, _, terminated, _, info = env.step(action)
+        assert terminated
+        assert not info["option_success"]
+        assert info["tau"] == 1
+
+
+def test_walks_and_other_options_do_not_mix(trained: SkillGraphAgent, options: list[Option], walker: Option) -> None:
+    for arguments in (([*trained.options, options[0]], None), (trained.options, walker)):
+        with pytest.raises(ValueError, match="go with no others"):
+            OptionsEnv(gym.make(TOY), arguments[0], global_option=arguments[1])  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="not this agent's"):
+        GraphPolicy(trained, lifted(options, walker))
 
 
 class Turns:
@@ -460,8 +487,10 @@ def test_q_learning_without_masks_and_what_it_refuses() -> None:
         SMDPQLearning("MlpPolicy", "CartPole-v1", replay_buffer_class=ReplayBuffer)
 
 
-def test_maskable_ppo_trains_on_it(options: list[Option], walker: Option) -> None:
-    env = Monitor(lifted(options, walker))
+@pytest.mark.parametrize("of_an_agent", [False, True])
+def test_maskable_ppo_trains_on_it(of_an_agent: bool, trained: SkillGraphAgent, options: list[Option], walker: Option) -> None:
+    toy = gym.make(TOY, terminate_on_success=True, max_steps=200)
+    env = Monitor(OptionsEnv(toy, trained.options, gamma=GAMMA) if of_an_agent else lifted(options, walker))
     model = MaskablePPO("MultiInputPolicy", env, n_steps=64, batch_size=32, n_epochs=2, seed=0)
     before = copy.deepcopy(model.policy.state_dict())
     model.learn(128)

@@ -1,9 +1,14 @@
 """Walks: the options that share one goal-conditioned policy, the walker."""
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_skillgraph.events import Event
+
+if TYPE_CHECKING:
+    from sb3_skillgraph.runner import Runner
 
 
 class Walk:
@@ -15,13 +20,15 @@ class Walk:
     :param target: id of the event it leads to
     :param termination: the event it leads to, where it ends
     :param learner: the SB3 model of the walker, which all walks share
+    :param runner: what runs it
     """
 
-    def __init__(self, id: str, termination: Event, learner: OffPolicyAlgorithm) -> None:
+    def __init__(self, id: str, termination: Event, learner: OffPolicyAlgorithm, runner: "Runner") -> None:
         self.id = id
         self.target = termination.id
         self.termination = termination
         self.learner = learner
+        self.runner = runner
 
     def __repr__(self) -> str:
         return f"<walk {self.id} to {self.target}>"

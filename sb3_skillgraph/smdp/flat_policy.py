@@ -4,8 +4,9 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from sb3_skillgraph.options.execution import Fate, fate
-from sb3_skillgraph.smdp.options_env import MASK, OptionsEnv, Run
+from sb3_skillgraph.options.execution import Fate
+from sb3_skillgraph.smdp.actions import Run
+from sb3_skillgraph.smdp.options_env import MASK, OptionsEnv
 
 
 class HighLevel(Protocol):
@@ -33,7 +34,7 @@ class FlatPolicy:
     Acts in the wrapped environment of an :class:`~sb3_skillgraph.OptionsEnv` as its high level would have it.
 
     :param high_level: chooses options
-    :param env: knows how options run; nothing happens in it
+    :param env: knows how options run; it is not stepped
     """
 
     def __init__(self, high_level: HighLevel, env: OptionsEnv) -> None:
@@ -61,7 +62,9 @@ class FlatPolicy:
         steps, memory = 0, None
         if state is not None and not (episode_start is not None and np.any(episode_start)):
             run, steps, memory = state[0].item(), int(state[1][0]), state[2].item()
-        if run is not None and fate(run.reached(np.asarray(observation["achieved_goal"])), steps, run.timeout) != Fate.RUNNING:
+        else:
+            self.env.actions.reset(observation)
+        if run is not None and self.env.fate(run, observation, steps) != Fate.RUNNING:
             run, steps = None, 0
         if run is None:
             seen = {**observation, MASK: self.env.masks_at(observation).astype(np.int8)}

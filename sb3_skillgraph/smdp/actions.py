@@ -1,0 +1,205 @@
+"""What options do as actions of an SMDP: when they can be taken, and how they run."""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from sb3_skillgraph.choices import Choices
+from sb3_skillgraph.options.execution import Fate, fate
+from sb3_skillgraph.options.option import Option
+from sb3_skillgraph.planning import DIRECT
+from sb3_skillgraph.runner import Chosen, Runner, RunnerState
+
+Observation = dict[str, np.ndarray]
+
+
+class Run(NamedTuple):
+    """One action while it is being executed.
+
+    :param id: the option's id, or ``primitive 0``, ...
+    :param option: whose policy acts; None for a primitive action or a walk
+    :param primitive: the primitive action, scaled to [-1, 1]; None for an option
+    :param aim: where the option is to go, shape ``(goal_dim,)``
+    :param timeout: environment steps it may take
+    """
+
+    id: str
+    option: Option | None
+    primitive: np.ndarray | None
+    aim: np.ndarray
+    timeout: float
+
+
+class Actions(Protocol):
+    """Options as actions, in the order of their making; last comes the walk straight to the goal, if there is one."""
+
+    has_direct: bool
+
+    def reset(self, observation: Observation) -> None:
+        """An episode begins."""
+
+    def n(self) -> int:
+        """Return how many there are by now, without the walk straight to the goal."""
+
+    def action_of(self, id: str) -> int | None:
+        """Return an option's action; None for the walk straight to the goal, and a KeyError for an unknown id."""
+
+    def masks(self, observation: Observation) -> np.ndarray:
+        """Tell which of those can be taken, bool array of shape ``(n,)``."""
+
+    def begin(self, observation: Observation, action: int | None) -> Run:
+        """Begin to run an option; None for the walk straight to the goal."""
+
+    def act(self, run: Run, observation: Observation) -> np.ndarray:
+        """Return what it does, scaled to [-1, 1], shape ``(action_dim,)``."""
+
+    def fate(self, run: Run, observation: Observation, steps: int, stuck: bool) -> Fate:
+        """Tell what has become of it after so many steps."""
+
+    def primitive(self) -> None:
+        """A primitive action was taken in between."""
+
+
+def batch_of_one(observation: Observation) -> Observation:
+    """Return an observation as rows: ``observation`` and ``achieved_goal``, shapes ``(1, dim)``."""
+    return {key: np.asarray(observation[key], dtype=np.float32).reshape(1, -1) for key in ("observation", "achieved_goal")}
+
+
+class OptionActions:
+    """Options with policies and initiation sets of their own; they can be taken where they can start.
+
+    :param options: the options, which may become more
+    :param direct: the option that walks to any goal, if there is one
+    :param timeout: environment steps an option may run; the walk straight to the goal, half of them
+    """
+
+    def __init__(self, options: Sequence[Option], direct: Option | None, timeout: int) -> None:
+        self.options = options
+        self.direct = direct
+        self.timeout = timeout
+        self.has_direct = direct is not None
+
+    def reset(self, observation: Observation) -> None:
+        """Nothing is remembered from step to step."""
+
+    def n(self) -> int:
+        """Return the number of options."""
+        return len(self.options)
+
+    def action_of(self, id: str) -> int | None:
+        """Return an option's action; None for the one that walks to any goal."""
+        if self.direct is not None and id == self.direct.id:
+            return None
+        return {option.id: i for i, option in enumerate(self.options)}[id]
+
+    def masks(self, observation: Observation) -> np.ndarray:
+        """Tell which options are mature and stand in their (optimistic) initiation set, not yet in their termination set."""
+        point = np.asarray(observation["achieved_goal"])
+        able = [o.mature and bool(o.initiation.optimistic(point[None])[0]) and not o.terminates(point) for o in self.options]
+        return np.array(able, dtype=bool)
+
+    def begin(self, observation: Observation, action: int | None) -> Run:
+        """Begin to run an option."""
+        option = self.direct if action is None else self.options[action]
+        assert option is not None
+        if action is None:
+            return Run(option.id, option, None, np.asarray(observation["desired_goal"]), self.timeout // 2)
+        return Run(option.id, option, None, option.subgoal, self.timeout)
+
+    def act(self, run: Run, observation: Observation) -> np.ndarray:
+        """Let its policy act."""
+        assert run.option is not None
+        seen = batch_of_one(observation)
+        see = run.option.replay.view
+        return run.option.actor.act(see(seen["observation"], seen["achieved_goal"], run.aim[None].astype(np.float32)))[0]
+
+    def fate(self, run: Run, observation: Observation, steps: int, stuck: bool = False) -> Fate:
+        """Tell whether it is where it leads, or at the goal."""
+        point, option = np.asarray(observation["achieved_goal"]), run.option
+        assert option is not None
+        reached = math.dist(point, run.aim) <= option.radius if option.target is None else option.terminates(point)
+        return fate(reached, steps, int(run.timeout), stuck)
+
+    def primitive(self) -> None:
+        """Nothing is remembered from step to step."""
+
+
+class WalkActions:
+    """An agent's walks, one for every event that it has or had, run as ``predict`` runs them.
+
+    A walk can be taken where the graph has an edge to it, and where it is a guess that plans consider.
+
+    :param runner: runs them
+    """
+
+    has_direct = True
+
+    def __init__(self, runner: Runner) -> None:
+        self.runner = runner
+        self.ids: list[str] = []
+        self.state = RunnerState.fresh(1, runner.graph.goal_dim, 0)
+        self._action_of: dict[str, int] = {}
+        self._chosen: Chosen | None = None
+
+    def reset(self, observation: Observation) -> None:
+        """Forget the last episode."""
+        dim = batch_of_one(observation)["observation"].shape[1]
+        self.state = RunnerState.fresh(1, self.runner.graph.goal_dim, dim)
+
+    def n(self) -> int:
+        """Return how many walks there have been; new ones come last, those whose event is gone stay."""
+        ids = self.runner.graph.walk_ids
+        if ids and (len(self.ids) < len(ids) or ids[-1] not in self._action_of):
+            for id in ids:
+                if id not in self._action_of:
+                    self._action_of[id] = len(self.ids)
+                    self.ids.append(id)
+        return len(self.ids)
+
+    def action_of(self, id: str) -> int | None:
+        """Return a walk's action; None for the walk straight to the goal."""
+        return None if id == DIRECT else self._action_of[id]
+
+    def choices(self, observation: Observation) -> Choices:
+        """Return what the agent could begin, as plans see it."""
+        point, goal = (np.asarray(observation[key]) for key in ("achieved_goal", "desired_goal"))
+        return self.runner.choices(self.state, 0, point, goal)
+
+    def masks(self, observation: Observation) -> np.ndarray:
+        """Tell which walks the agent considers here."""
+        mask = np.zeros(self.n(), dtype=bool)
+        walk_ids = self.runner.graph.walk_ids
+        mask[[self._action_of[walk_ids[i]] for i in self.choices(observation).target if i < len(walk_ids)]] = True
+        return mask
+
+    def begin(self, observation: Observation, action: int | None) -> Run:
+        """Begin a walk, with the time that the agent would give it."""
+        point, goal = (np.asarray(observation[key]) for key in ("achieved_goal", "desired_goal"))
+        choices, graph = self.choices(observation), self.runner.graph
+        target = len(graph.events) if action is None else graph.index(self.ids[action])
+        row = int(np.flatnonzero(choices.target == target)[0])
+        self._chosen = self.runner.option_of(choices, row, self.runner.start(self.state, 0, point), goal)
+        return Run(self._chosen.option, None, None, self._chosen.aim, self._chosen.timeout)
+
+    def act(self, run: Run, observation: Observation) -> np.ndarray:
+        """Let the walker act."""
+        chosen, goals = self._chosen, np.asarray(observation["desired_goal"], dtype=np.float32)[None]
+        assert chosen is not None
+        scaled, self.state = self.runner.act(batch_of_one(observation), goals, self.state, choose=lambda *_: chosen)
+        return scaled[0]
+
+    def fate(self, run: Run, observation: Observation, steps: int, stuck: bool = False) -> Fate:
+        """Let the runner tell whether the walk has ended."""
+        points = np.asarray(observation["achieved_goal"], dtype=np.float32)[None]
+        self.state, runs = self.runner.advance(self.state, points, [stuck])
+        if not runs:
+            return Fate.RUNNING
+        if stuck:
+            return Fate.STUCK
+        return Fate.SUCCEEDED if runs[0].success else Fate.TIMED_OUT
+
+    def primitive(self) -> None:
+        """A step was taken: the agent is where it finds itself."""
+        self.state = self.state._replace(arrived=np.zeros_like(self.state.arrived), elapsed=self.state.elapsed + 1)
