@@ -24,10 +24,12 @@ from sb3_skillgraph.interrupts import Interrupts
 from sb3_skillgraph.learning.episodes import Episodes
 from sb3_skillgraph.learning.salience import Salience
 from sb3_skillgraph.options.learner import OptionDDPG
+from sb3_skillgraph.options.option import Option
 from sb3_skillgraph.options.views import View
 from sb3_skillgraph.options.walk import Walk
 from sb3_skillgraph.parts import Parts
-from sb3_skillgraph.plan import Plan, describe
+from sb3_skillgraph.plan import Plan
+from sb3_skillgraph.rules import PaperRules
 from sb3_skillgraph.runner import Run, RunnerState
 from sb3_skillgraph.saving import PathOrFile, load_tree, save_tree
 from sb3_skillgraph.vec_env import LeanVecEnv
@@ -84,6 +86,7 @@ class SkillGraphAgent(OffPolicyAlgorithm):
     :param hindsight: share of sampled transitions relabelled with a goal achieved later
     :param goal_tolerance: how near to its goal the walker must learn to come, in event radii, 1 at most
     :param shaping: reward for every event radius of distance gained, beside -1 a step; 0 for none [2.1]
+    :param rules: the paper's rules in place of the graph of walks: with ``**PAPER`` the paper as written; None for the default
     :raises ValueError: if the environment is no goal environment with Box actions, or an argument is out of range
     """
 
@@ -123,6 +126,7 @@ class SkillGraphAgent(OffPolicyAlgorithm):
         hindsight: float = 0.8,
         goal_tolerance: float = 0.5,
         shaping: float = 0.0,
+        rules: PaperRules | None = None,
     ) -> None:
         # The keyword arguments as given: what is saved, and what load() builds the agent from.
         self._arguments = {k: v for k, v in locals().items() if k not in ("self", "env", "_init_setup_model", "__class__")}
@@ -152,6 +156,7 @@ class SkillGraphAgent(OffPolicyAlgorithm):
             sde_support=False,
             support_multi_env=True,
         )
+        self.rules = rules
         self._interrupts = Interrupts()
         self._env_snapshot: dict[str, Any] | None = None
         self._loaded = ""  # by which update a loaded agent was trained
@@ -175,11 +180,18 @@ class SkillGraphAgent(OffPolicyAlgorithm):
         self.set_random_seed(self.seed)
         self._convert_train_freq()
         self._spec = GoalSpec.of(self.observation_space, self.action_space)
-        self.parts = Parts.build(self, self._spec, self._arguments)
+        self.parts = self._build_parts()
         # Under SB3's names as well: CheckpointCallback looks for the one, users for the other.
-        self.replay_buffer = self.parts.store  # type: ignore[assignment]
+        self.replay_buffer = self.parts.store
         self.policy = self.parts.walker.learner.policy
         self.episodes = Episodes(self)
+
+    def _build_parts(self) -> Any:
+        if self.rules is None:
+            return Parts.build(self, self._spec, self._arguments)
+        from sb3_skillgraph.paper.parts import PaperParts  # when it is used: networkx takes a while to import
+
+        return PaperParts.build(self, self._spec, self._arguments)
 
     # -- what it knows ------------------------------------------------------------------------------------------------
 
@@ -194,10 +206,12 @@ class SkillGraphAgent(OffPolicyAlgorithm):
         return list(self.graph.events)
 
     @property
-    def options(self) -> list[Walk]:
-        """All options of the graph: the walks, one to each event. They share their SB3 model, ``option.learner``."""
-        learner, runner = self.parts.walker.learner, self.parts.runner
-        return [Walk(id, event, learner, runner) for id, event in zip(self.graph.walk_ids, self.graph.events, strict=True)]
+    def options(self) -> list[Walk] | list[Option]:
+        """All options: the walks, one to each event, which share their SB3 model, ``option.learner``.
+
+        With ``**PAPER`` they are skills, each with a model of its own.
+        """
+        return self.parts.options()
 
     @property
     def event_radius(self) -> float:
@@ -296,7 +310,7 @@ class SkillGraphAgent(OffPolicyAlgorithm):
 
     def train(self, gradient_steps: int, batch_size: int = 100) -> None:
         """
-        Do minibatch updates of the walker.
+        Do minibatch updates of the walker; with ``**PAPER``, of the options that run.
 
         :param gradient_steps: number of updates
         :param batch_size: transitions in a minibatch
@@ -305,12 +319,16 @@ class SkillGraphAgent(OffPolicyAlgorithm):
             return  # loaded without its replay buffer: first gather some experience
         if self.gradient_steps > 0:
             gradient_steps *= self.n_envs  # as many for a step, however many environments take it at once
-        learner = self.parts.walker.learner
-        learner._current_progress_remaining = self._current_progress_remaining
-        learner.train(gradient_steps, batch_size)
+        for option in self.parts.learners():
+            if option.replay.size() >= batch_size:
+                self._train(option.learner, gradient_steps, batch_size)
         self._n_updates += gradient_steps
         self.graph.now = float(self._n_updates)  # records age as the walker learns
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+
+    def _train(self, learner: OffPolicyAlgorithm, gradient_steps: int, batch_size: int) -> None:
+        learner._current_progress_remaining = self._current_progress_remaining
+        learner.train(gradient_steps, batch_size)
         for name, value in learner.logger.name_to_value.items():
             if name != "train/n_updates":
                 self.logger.record(name, value)
@@ -408,7 +426,7 @@ class SkillGraphAgent(OffPolicyAlgorithm):
         target = batch["desired_goal"][0] if goal is None else as_goal(goal, self._spec.goal_dim)
         running = self._running_state(1, state)
         running, _ = self.parts.runner.advance(running, batch["achieved_goal"])
-        return describe(self.parts.runner, running, batch["achieved_goal"][0], target.astype(np.float32))
+        return self.parts.plan(running, batch["achieved_goal"][0], target.astype(np.float32))
 
     def adapt(
         self: SelfSkillGraphAgent,
@@ -485,7 +503,7 @@ class SkillGraphAgent(OffPolicyAlgorithm):
 
         :raises OSError: if the file cannot be written; an old file of that name is then untouched
         """
-        save_tree(path, "replay_buffer", self.parts.store.get_state())
+        save_tree(path, "replay_buffer", self.parts.get_experience())
 
     def load_replay_buffer(self, path: PathOrFile, truncate_last_traj: bool = True) -> None:
         """
@@ -493,7 +511,7 @@ class SkillGraphAgent(OffPolicyAlgorithm):
 
         :raises ValueError: if the file is damaged or holds something else, or does not fit this agent
         """
-        persistence.restore_store(self.parts.store, load_tree(path, "replay_buffer"))
+        persistence.restore_experience(self.parts, load_tree(path, "replay_buffer"))
 
     @classmethod
     def load(

@@ -1,7 +1,7 @@
 """The parts of an agent, and how they are put together (Figure 10)."""
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from gymnasium import spaces
@@ -21,8 +21,10 @@ from sb3_skillgraph.options.factory import OptionFactory
 from sb3_skillgraph.options.learner import OptionDDPG, OptionLearner, OptionTD3
 from sb3_skillgraph.options.option import Option
 from sb3_skillgraph.options.views import ScaledView
+from sb3_skillgraph.options.walk import Walk
+from sb3_skillgraph.plan import Plan, describe
 from sb3_skillgraph.planning import Planner
-from sb3_skillgraph.runner import Runner
+from sb3_skillgraph.runner import Runner, RunnerState
 from sb3_skillgraph.walk_model import WalkModel
 
 NET_ARCH = [128, 128]  # of the walker's networks
@@ -34,6 +36,71 @@ HORIZON = 1_000
 #: Steps ahead from which hindsight draws achieved goals.
 HINDSIGHT_STEPS = 200
 OPTION_CLASSES: dict[str, type[OffPolicyAlgorithm]] = {cls.__name__: cls for cls in (OptionDDPG, OptionTD3, DDPG, TD3, SAC)}
+
+
+class Common(NamedTuple):
+    """What every agent has, whatever its graph is.
+
+    :param rng: the generator of all that is random
+    :param view_name: name of what policies see, None for a function
+    :param view: what policies see
+    :param store: the transitions
+    :param factory: makes options
+    :param walker: the option that walks to any goal
+    :param radius: of events, in goal units
+    """
+
+    rng: np.random.Generator
+    view_name: str | None
+    view: ScaledView
+    store: TransitionStore
+    factory: OptionFactory
+    walker: Option
+    radius: float
+
+    @classmethod
+    def build(
+        cls, agent: OffPolicyAlgorithm, spec: GoalSpec, arguments: dict[str, Any], replay: dict[str, Any] | None = None
+    ) -> "Common":
+        """Check the arguments, and build what follows from them directly.
+
+        :param agent: gives environment, spaces, SB3's arguments and device
+        :param spec: lengths of observation, goal and action
+        :param arguments: the agent's keyword arguments
+        :param replay: further arguments of the options' replay buffers
+        """
+        check_numbers(arguments)
+        rng = np.random.default_rng(agent.seed)
+        radius = _event_radius(arguments["event_radius"], agent.env)
+        view_name, function = find_view(arguments["option_view"], agent.env, spec)
+        view = ScaledView(function, radius)
+        store = TransitionStore(agent.buffer_size, spec.observation_dim, spec.goal_dim, spec.action_dim, agent.n_envs)
+        factory = OptionFactory(
+            option_class(arguments["option_class"]),
+            _option_kwargs(agent, arguments),
+            store,
+            view,
+            _box(agent.action_space),
+            radius,
+            arguments["goal_tolerance"] * radius,
+            rng,
+            {"hindsight": arguments["hindsight"], "horizon": HINDSIGHT_STEPS, **(replay or {})},
+            agent.device,
+            arguments["shaping"],
+        )
+        return cls(rng, view_name, view, store, factory, factory.make("walker", None, None), radius)
+
+    def rollout(self, runner: Runner, missions: Any, witness: Any, arguments: dict[str, Any]) -> Rollout:
+        """Build what learns from steps.
+
+        :param runner: runs options
+        :param missions: what the agent is about
+        :param witness: learns from runs
+        :param arguments: the agent's keyword arguments
+        """
+        noise = arguments["action_noise"]
+        deviation = noise if isinstance(noise, int | float) else 0.0
+        return Rollout(runner, missions, witness, self.store, deviation, arguments["random_action_prob"], self.rng)
 
 
 @dataclass
@@ -61,50 +128,58 @@ class Parts:
         :param spec: lengths of observation, goal and action
         :param arguments: the agent's keyword arguments
         """
-        check_numbers(arguments)
-        rng = np.random.default_rng(agent.seed)
-        radius = _event_radius(arguments["event_radius"], agent.env)
-        view_name, function = find_view(arguments["option_view"], agent.env, spec)
-        view = ScaledView(function, radius)
-        store = TransitionStore(agent.buffer_size, spec.observation_dim, spec.goal_dim, spec.action_dim, agent.n_envs)
-        factory = OptionFactory(
-            option_class(arguments["option_class"]),
-            _option_kwargs(agent, arguments),
-            store,
-            view,
-            _box(agent.action_space),
-            radius,
-            arguments["goal_tolerance"] * radius,
-            rng,
-            {"hindsight": arguments["hindsight"], "horizon": HINDSIGHT_STEPS},
-            agent.device,
-            arguments["shaping"],
-        )
-        walker = factory.make("walker", None, None)
+        common = Common.build(agent, spec, arguments)
+        rng, view_name, view, store, factory, walker, radius = common
         graph = SkillGraph(spec.goal_dim, radius, arguments["max_events"], arguments["walk_steps"])
         model = WalkModel()
-        planner = Planner(graph, model, _horizon(agent.env))
+        planner = Planner(graph, model, horizon(agent.env))
         runner = Runner(graph, planner, walker.actor, view)
-        salience = _salience(arguments, graph, store, agent)
         missions = Missions(
             graph,
-            salience,
+            find_salience(arguments, graph, store, agent),
             arguments["exploration_steps"],
             arguments["explore_beyond"],
             rng,
         )
         witness = Witness(graph, planner.choice_model, agent.n_envs)
-        noise = arguments["action_noise"]
-        rollout = Rollout(
-            runner,
-            missions,
-            witness,
-            store,
-            noise if isinstance(noise, int | float) else 0.0,
-            arguments["random_action_prob"],
-            rng,
-        )
+        rollout = common.rollout(runner, missions, witness, arguments)
         return cls(rng, view_name, factory, store, walker, graph, model, planner, runner, missions, witness, rollout)
+
+    def options(self) -> list[Any]:
+        """Return all options: the walks, one to each event, which share their SB3 model."""
+        graph, learner = self.graph, self.walker.learner
+        return [Walk(id, event, learner, self.runner) for id, event in zip(graph.walk_ids, graph.events, strict=True)]
+
+    def plan(self, state: RunnerState, point: np.ndarray, goal: np.ndarray) -> Plan:
+        """Tell how the agent goes about a goal.
+
+        :param state: of one environment, advanced to this step
+        :param point: where the agent stands, shape ``(goal_dim,)``
+        :param goal: shape ``(goal_dim,)``
+        """
+        return describe(self.runner, state, point, goal)
+
+    def learners(self) -> list[Option]:
+        """Return the options whose networks learn now."""
+        return [self.walker]
+
+    def get_state(self) -> dict[str, Any]:
+        """Return what has been learned beside the walker's networks, as plain data."""
+        return {"horizon": self.planner.horizon, "graph": self.graph.get_state(), "model": self.model.get_state()}
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Restore what :meth:`get_state` returned."""
+        self.planner.horizon = state["horizon"]
+        self.graph.set_state(state["graph"])
+        self.model.set_state(state["model"])
+
+    def get_experience(self) -> dict[str, Any]:
+        """Return what goes with the replay buffer, as plain data."""
+        return self.store.get_state()
+
+    def set_experience(self, state: dict[str, Any]) -> None:
+        """Restore what :meth:`get_experience` returned."""
+        self.store.set_state(state)
 
     def unscale(self, scaled: np.ndarray) -> np.ndarray:
         """Turn actions in [-1, 1], shape ``(n, action_dim)``, into the environment's own, shape ``(n, *action_shape)``."""
@@ -194,8 +269,11 @@ def _event_radius(given: float | None, env: VecEnv | None) -> float:
     return float(radius)
 
 
-def _horizon(env: VecEnv | None) -> int:
-    """Return the environment's time limit, by the names in use."""
+def horizon(env: VecEnv | None) -> int:
+    """Return an environment's time limit, by the names in use.
+
+    :param env: the environment
+    """
     if env is not None:
         for name in ("max_steps", "_max_episode_steps"):
             limit = env_attribute(env, name)
@@ -219,12 +297,20 @@ def _option_kwargs(agent: OffPolicyAlgorithm, arguments: dict[str, Any]) -> dict
     return {**kwargs, **(arguments["option_kwargs"] or {})}
 
 
-def _salience(arguments: dict[str, Any], graph: SkillGraph, store: TransitionStore, agent: OffPolicyAlgorithm) -> Salience:
+def find_salience(arguments: dict[str, Any], graph: SkillGraph, store: TransitionStore, agent: OffPolicyAlgorithm) -> Salience:
+    """Return what proposes salient events.
+
+    :param arguments: the agent's keyword arguments
+    :param graph: the skill graph
+    :param store: the transitions
+    :param agent: gives the environment
+    :raises ValueError: if there is no such thing
+    """
     salience = arguments["salience"]
     if salience == "frontier":
         return FrontierSalience(graph)
     if salience == "dco":
-        return DCOSalience(store, graph, graph.walk_steps)
+        return DCOSalience(store, graph.walk_steps)
     if salience == "rrt":
         return RandomSalience(Oracle(agent.get_env))
     if not hasattr(salience, "propose"):

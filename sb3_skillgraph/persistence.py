@@ -6,6 +6,7 @@ import warnings
 from collections import deque
 from collections.abc import Iterable
 from copy import deepcopy
+from dataclasses import asdict
 from inspect import signature
 from typing import Any
 
@@ -19,8 +20,8 @@ from stable_baselines3.common.save_util import recursive_getattr
 from stable_baselines3.common.utils import check_for_correct_spaces
 
 from sb3_skillgraph.goal_env import refuse_vec_normalize
-from sb3_skillgraph.memory.store import TransitionStore
 from sb3_skillgraph.options.learner import OptionDDPG, OptionLearner, OptionTD3
+from sb3_skillgraph.rules import PaperRules
 from sb3_skillgraph.saving import MissingCallable, PathOrFile, known_class, load_tree
 
 for _option_class in (OptionDDPG, OptionTD3):
@@ -42,12 +43,10 @@ def agent_tree(agent: Any, left_out: Iterable[str]) -> dict[str, Any]:
         "arguments": {name: value for name, value in _arguments(agent).items() if name not in left_out},
         "spaces": {"observation": describe_space(agent.observation_space), "action": describe_space(agent.action_space)},
         "n_envs": agent.n_envs,
-        "horizon": parts.planner.horizon,
         "walker": parts.walker.learner._n_updates,
         "update_path": _update_path(parts.walker.learner),
         "parameters": agent.get_parameters(),
-        "graph": parts.graph.get_state(),
-        "model": parts.model.get_state(),
+        **parts.get_state(),
         "progress": _progress(agent),
     }
 
@@ -62,6 +61,8 @@ def _arguments(agent: Any) -> dict[str, Any]:
     for name in ("batch_size", "gradient_steps", "learning_starts", "verbose"):
         arguments[name] = getattr(agent, name)
     arguments["event_radius"] = agent.event_radius
+    if agent.rules is not None:
+        arguments["rules"] = asdict(agent.rules)
     if agent.action_noise is not None:
         arguments["action_noise"] = agent.action_noise
     if agent.parts.view_name is not None:
@@ -128,7 +129,10 @@ def load(cls: Any, path: PathOrFile, env: Any, device: Any, given: dict[str, Any
 
 
 def _build(cls: Any, tree: dict[str, Any], env: Any, device: Any, given: dict[str, Any], force_reset: bool) -> Any:
-    arguments = {"policy": "MultiInputPolicy", **tree["arguments"], "device": device, **given}
+    arguments = {"policy": "MultiInputPolicy", **tree["arguments"], "device": device}
+    if arguments.get("rules") is not None:
+        arguments["rules"] = PaperRules(**arguments["rules"])
+    arguments.update(given)
     require_callables(arguments)
     agent = cls(env=None, _init_setup_model=False, **arguments)
     agent.observation_space = make_space(tree["spaces"]["observation"])
@@ -167,10 +171,8 @@ def copy(agent: Any, env: Any) -> Any:
 def _restore(agent: Any, tree: dict[str, Any], same_envs: bool) -> None:
     """Give a new agent what another one has learned."""
     parts = agent.parts
-    parts.planner.horizon = tree["horizon"]
     parts.walker.learner._n_updates = tree["walker"]
-    parts.graph.set_state(tree["graph"])
-    parts.model.set_state(tree["model"])
+    parts.set_state(tree)
     agent.set_parameters(tree["parameters"], exact_match=True, device=agent.device)
     progress = tree["progress"]
     for name in _COUNTERS:
@@ -260,21 +262,21 @@ def load_parameters(learner: OffPolicyAlgorithm, tree: dict[str, Any], exact_mat
         raise ValueError(f"The parameters in the file do not fit this agent ({error!r}).") from error
 
 
-def restore_store(store: TransitionStore, state: dict[str, Any]) -> None:
-    """Give a store the rows of a file; all of them, or none.
+def restore_experience(parts: Any, state: dict[str, Any]) -> None:
+    """Give an agent's store the rows of a file; all of them, or none.
 
-    :param store: the store
-    :param state: what its ``get_state`` returned
+    :param parts: the agent's parts
+    :param state: what their ``get_experience`` returned
     :raises ValueError: if they do not fit
     """
-    before = store.get_state()
+    before = parts.get_experience()
     try:
-        store.set_state(state)
+        parts.set_experience(state)
     except UNFIT as error:
-        store.set_state(before)
+        parts.set_experience(before)
         raise ValueError(f"The rows in the file do not fit this agent ({error!r}).") from error
     except ValueError:
-        store.set_state(before)
+        parts.set_experience(before)
         raise
 
 

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -11,6 +11,7 @@ from sb3_skillgraph.choices import EXPECTED, OPTIMISTIC, PESSIMISTIC, Choices, R
 from sb3_skillgraph.edges import NOWHERE
 from sb3_skillgraph.graph import SkillGraph
 from sb3_skillgraph.options.numpy_actor import NumpyActor
+from sb3_skillgraph.options.option import Option
 from sb3_skillgraph.options.views import View
 from sb3_skillgraph.planning import DIRECT, GOAL, Planner, Solution
 from sb3_skillgraph.walk_model import timeout
@@ -105,6 +106,7 @@ class Run:
     :param steps: environment steps it took
     :param aim: where it walked to, shape ``(goal_dim,)``
     :param stood_still: whether it ended since the agent stood still
+    :param stuck: whether it ended since the agent can do nothing any more
     """
 
     env: int
@@ -115,6 +117,7 @@ class Run:
     steps: int
     aim: np.ndarray
     stood_still: bool = False
+    stuck: bool = False
 
 
 class Chosen(NamedTuple):
@@ -132,6 +135,17 @@ class Chosen(NamedTuple):
     timeout: float
 
 
+class Rules(Protocol):
+    """What the paper does in place of the planner."""
+
+    @property
+    def skills(self) -> dict[str, Option]:
+        """The options that have a policy of their own, by their ids."""
+
+    def choose(self, state: RunnerState, i: int, point: np.ndarray, goal: np.ndarray, stance: float) -> Chosen:
+        """Choose an option as :meth:`Runner.choose` does."""
+
+
 #: Chooses an option, given the state, the environment, where the agent stands, the goal and the stance.
 Chooser = Callable[[RunnerState, int, np.ndarray, np.ndarray, float], Chosen]
 
@@ -145,13 +159,20 @@ class Runner:
     :param planner: plans over it
     :param actor: the walker's policy
     :param view: what a policy sees
+    :param rules: what chooses options in place of the planner, if there is such a thing
     """
 
-    def __init__(self, graph: SkillGraph, planner: Planner, actor: NumpyActor, view: View) -> None:
+    def __init__(self, graph: SkillGraph, planner: Planner, actor: NumpyActor, view: View, rules: Rules | None = None) -> None:
         self.graph = graph
         self.planner = planner
         self.actor = actor
         self.view = view
+        self.rules = rules
+
+    @property
+    def skills(self) -> dict[str, Option]:
+        """The options that have a policy of their own, by their ids."""
+        return {} if self.rules is None else self.rules.skills
 
     # -- one step -----------------------------------------------------------------------------------------------------
 
@@ -170,9 +191,9 @@ class Runner:
             if not option:
                 continue
             lost = stuck is not None and bool(stuck[i])
-            arrived = not lost and math.dist(points[i].tolist(), state.aim[i].tolist()) <= self.graph.radius
+            arrived = not lost and self._has_arrived(option, points[i], state.aim[i])
             # Its event may have been merged with others since.
-            gone = option != DIRECT and self.graph.index(option) == NOWHERE
+            gone = option != DIRECT and option not in self.skills and self.graph.index(option) == NOWHERE
             if arrived or lost or gone or state.steps[i] >= state.timeout[i]:
                 runs.append(self._run(state, i, points[i], arrived, lost))
         if runs:
@@ -181,14 +202,21 @@ class Runner:
                 self._end(state, run)
         return state, runs
 
+    def _has_arrived(self, option: str, point: np.ndarray, aim: np.ndarray) -> bool:
+        """Tell whether an option has reached its termination set."""
+        if option in self.skills:
+            return self.skills[option].terminates(point)
+        return math.dist(point.tolist(), aim.tolist()) <= self.graph.radius
+
     def _run(self, state: RunnerState, i: int, point: np.ndarray, arrived: bool, lost: bool) -> Run:
         option = str(state.option[i])
-        if arrived:
+        if arrived and option not in self.skills:
             landing = GOAL if option == DIRECT else self.graph.id(self.graph.index(option))
         else:
             landing = "" if lost else self.graph.id(self.graph.locate(point))
         stood_still = not (arrived or lost) and state.still[i] >= STILL_STEPS
-        return Run(i, str(state.began[i]), option, landing, arrived, int(state.steps[i]), state.aim[i].copy(), stood_still)
+        steps, aim = int(state.steps[i]), state.aim[i].copy()
+        return Run(i, str(state.began[i]), option, landing, arrived, steps, aim, stood_still, lost)
 
     def _end(self, state: RunnerState, run: Run) -> None:
         """Write a run into the record of the episode, in place."""
@@ -238,18 +266,24 @@ class Runner:
             chosen = (choose or self.choose)(state, i, points[i], goals[i], stance)
             state.option[i], state.began[i], state.aim[i], state.timeout[i] = chosen
             state.steps[i] = state.still[i] = 0
-        actions = self.actor.act(self.view(observation["observation"], points, state.aim))
+        seen = self.view(observation["observation"], points, state.aim)
+        actions = self.actor.act(seen)
+        for i, option in enumerate(state.option.tolist() if self.skills else ()):
+            if option in self.skills:
+                actions[i] = self.skills[option].actor.act(seen[i : i + 1])[0]
         return actions, state._replace(steps=state.steps + 1, elapsed=state.elapsed + 1)
 
-    @staticmethod
-    def _with_stillness(state: RunnerState, seen: np.ndarray) -> RunnerState:
-        """Return the state with what has changed since the last step; who stands still has no time after this one."""
+    def _with_stillness(self, state: RunnerState, seen: np.ndarray) -> RunnerState:
+        """Return the state with what has changed since the last step.
+
+        Who stands still has no time after this one, but for the paper's rules, which know no such thing.
+        """
         change = np.abs(seen - state.seen) * (state.elapsed > 0)[:, None]
         most = np.where(state.pace > 0.0, FASTER * state.pace, change)
         pace = np.maximum(SLOWER * state.pace, np.minimum(change, most))
         stands = (change <= STILL * pace).all(axis=1) & (state.elapsed > 0)
         still = np.where(stands, state.still + 1, 0)
-        time = np.where(still >= STILL_STEPS, 0.0, state.timeout)
+        time = state.timeout if self.rules is not None else np.where(still >= STILL_STEPS, 0.0, state.timeout)
         return state._replace(seen=seen, pace=pace, still=still, timeout=time)
 
     # -- choosing an option -------------------------------------------------------------------------------------------
@@ -289,6 +323,8 @@ class Runner:
         :param goal: where it is to go, same shape
         :param stance: what the plan counts on
         """
+        if self.rules is not None:
+            return self.rules.choose(state, i, point, goal, stance)
         start = self.start(state, i, point)
         solution = self.decide(state, i, start, goal, stance)
         return self.option_of(solution.episode, solution.first(), start, goal)

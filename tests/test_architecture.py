@@ -15,6 +15,7 @@ ROOT = Path(sb3_skillgraph.__file__).parent
 FLOORS: dict[str, float] = {
     "version": 0,  # a constant
     "interrupts": 0,
+    "rules": 0,  # numbers
     "vec_env": 0,
     "events": 0,
     "saving": 0.5,  # writes the version
@@ -33,6 +34,7 @@ FLOORS: dict[str, float] = {
     "learning": 9,
     "parts": 10,  # how all of these are put together
     "persistence": 10,
+    "paper": 10.5,  # what PAPER does instead
     "agent": 11,
     "smdp": 11,  # on options, not on the agent
     "callbacks": 12,

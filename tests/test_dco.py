@@ -10,7 +10,6 @@ from conftest import TOY, differences, new_agent
 from scipy.stats import spearmanr
 
 from sb3_skillgraph import SkillGraphAgent
-from sb3_skillgraph.graph import SkillGraph
 from sb3_skillgraph.learning import dco
 from sb3_skillgraph.learning.dco import LEARN_EVERY, DCOSalience, FiedlerEmbedding
 from sb3_skillgraph.memory.store import TransitionStore
@@ -62,14 +61,11 @@ def test_it_says_when_it_has_learned_nothing() -> None:
         FiedlerEmbedding()(np.zeros((1, 2)))
 
 
-def corridor(n_steps: int) -> tuple[TransitionStore, SkillGraph]:
-    """A random walk along a corridor from x = 0 to 10, and an event at every second unit of it."""
+def corridor(n_steps: int) -> TransitionStore:
+    """A random walk along a corridor from x = 0 to 10."""
     store, rng = TransitionStore(2 * n_steps, 2, 2, 1), np.random.default_rng(0)
-    graph = SkillGraph(2, 0.5, max_events=500)
-    for x in range(0, 11, 2):
-        graph.add_event(np.array([x, 0.0]), salient=False)
     walk_along(store, n_steps, rng)
-    return store, graph
+    return store
 
 
 def walk_along(store: TransitionStore, n_steps: int, rng: np.random.Generator) -> None:
@@ -83,13 +79,14 @@ def walk_along(store: TransitionStore, n_steps: int, rng: np.random.Generator) -
 
 
 def test_it_proposes_the_two_ends_and_learns_anew_after_much_experience(monkeypatch: pytest.MonkeyPatch) -> None:
-    store, graph = corridor(3_000)
-    salience, rng = DCOSalience(store, graph, reach=20, n_pairs=2_000), np.random.default_rng(0)
+    store = corridor(3_000)
+    salience, rng = DCOSalience(store, reach=20, n_pairs=2_000), np.random.default_rng(0)
     learned = []
     learn = dco.learn_fiedler
     monkeypatch.setattr(dco, "learn_fiedler", lambda *arguments: learned.append(store.total) or learn(*arguments))
     proposed = np.array([salience.propose(rng) for _ in range(30)])
     assert {tuple(point) for point in proposed} == {(0.0, 0.0), (10.0, 0.0)}
+    assert (proposed[1:] != proposed[:-1]).any(axis=1).all()  # in turn
     walk_along(store, LEARN_EVERY - 1, rng)
     salience.propose(rng)
     assert learned == [3_000]
@@ -97,7 +94,7 @@ def test_it_proposes_the_two_ends_and_learns_anew_after_much_experience(monkeypa
     salience.propose(rng)
     assert learned == [3_000, 3_000 + LEARN_EVERY]
     # Another one that is given its state goes on like it.
-    other = DCOSalience(store, graph, reach=20, n_pairs=2_000)
+    other = DCOSalience(store, reach=20, n_pairs=2_000)
     other.set_state(salience.get_state())
     for seed in range(5):
         points = [each.propose(np.random.default_rng(seed)) for each in (salience, other)]
@@ -107,9 +104,7 @@ def test_it_proposes_the_two_ends_and_learns_anew_after_much_experience(monkeypa
 
 def test_it_proposes_nothing_before_there_is_experience() -> None:
     rng = np.random.default_rng(0)
-    store, graph = corridor(10)
-    assert DCOSalience(TransitionStore(10, 2, 2, 1), graph, 20).propose(rng) is None
-    assert DCOSalience(store, SkillGraph(2, 0.5, max_events=500), 20).propose(rng) is None
+    assert DCOSalience(TransitionStore(10, 2, 2, 1), 20).propose(rng) is None
 
 
 def test_an_agent_explores_from_the_ends_of_what_it_knows(tmp_path: Path) -> None:
@@ -119,7 +114,8 @@ def test_an_agent_explores_from_the_ends_of_what_it_knows(tmp_path: Path) -> Non
     assert isinstance(salience, DCOSalience)
     ends = np.array(salience.get_state()["ends"])
     assert ends.shape == (2, 2)
-    assert (np.linalg.norm(agent.graph.centers[:, None] - ends, axis=2).min(axis=0) < 1e-9).all()
+    visited = agent.parts.store.column("achieved_goal", np.arange(agent.parts.store.total))
+    assert (np.linalg.norm(visited[:, None] - ends, axis=2).min(axis=0) < 1e-9).all()
     # The maze is a corridor around a wall: from one end to the other is further than from either to the middle.
     assert np.linalg.norm(ends[0] - ends[1]) > 1.5
     agent.save(tmp_path / "agent")

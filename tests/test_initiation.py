@@ -115,58 +115,6 @@ def test_failures_carve() -> None:
     assert not (initiation.optimistic(points) & ~before).any()  # failures never add
 
 
-def test_a_region_joins_the_set_and_leaves_it() -> None:
-    initiation = corridor()
-    initiation.refit(force=True)
-    points, region = grid(-4.0, 6.0), np.array([-3.0, 2.0]) + np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]])
-    before = initiation.optimistic(points)
-    assert not initiation.optimistic(region).any()
-    initiation.set_region("e3", region)
-    assert initiation.refit(force=True)
-    assert initiation.optimistic(region).all()
-    assert initiation.optimistic(np.concatenate(initiation.successes)).mean() > 0.95  # the corridor stays
-    initiation.set_region("e4", region + 3.0)
-    initiation.refit(force=True)
-    assert initiation.optimistic(np.concatenate([region, region + 3.0])).mean() >= 0.9
-    for name in ("e3", "e4", "e4"):
-        initiation.set_region(name, None)
-    initiation.refit(force=True)
-    np.testing.assert_array_equal(initiation.optimistic(points), before)
-
-
-def test_failures_carve_a_region_too() -> None:
-    initiation = corridor()
-    region = np.array([0.0, 3.0]) + np.array([[0, 0], [0.5, 0], [-0.5, 0], [0, 0.5], [0, -0.5]])
-    initiation.set_region("e3", region)
-    initiation.refit(force=True)
-    assert initiation.optimistic(region).all()
-    for seed in range(12):
-        initiation.add_failure(region[0] + np.random.default_rng(seed).normal(0.0, 0.3, 2))
-    initiation.refit(force=True)
-    assert not initiation.optimistic(region[:1])[0]
-
-
-def test_a_region_alone_describes_no_set() -> None:
-    initiation = InitiationSet(RADIUS)
-    initiation.set_region("e3", grid())
-    assert not initiation.refit(force=True)
-    assert not initiation.is_fitted
-    assert not initiation.optimistic(grid()).any()
-
-
-def test_a_region_is_news_once() -> None:
-    initiation = corridor(5)
-    initiation.refit()
-    initiation.set_region("e3", grid())
-    assert initiation.refit()
-    initiation.set_region("e3", grid())
-    assert not initiation.refit()
-    initiation.set_region("e4", None)
-    assert not initiation.refit()
-    initiation.set_region("e3", None)
-    assert initiation.refit()
-
-
 def test_successes_outvote_failures_at_the_same_place() -> None:
     initiation = corridor(n_successes=2)
     spot = np.array([0.0, 3.0])
@@ -237,7 +185,6 @@ def test_one_short_success_describes_a_place() -> None:
 def test_state_round_trip(fitted: bool) -> None:
     initiation = with_failures() if fitted else InitiationSet(RADIUS)
     initiation.add_success(path([0.0, 0.0], [0.0, 4.0]))
-    initiation.set_region("e3", grid(6.0, 7.0, 2))
     restored = InitiationSet(RADIUS)
     restored.set_state(copy.deepcopy(initiation.get_state()))
     points = grid()
@@ -250,7 +197,3 @@ def test_state_round_trip(fitted: bool) -> None:
         for either in (initiation, restored):
             either.add_failure(np.array([0.0, 3.0]))
         assert restored.refit() == initiation.refit()
-    for either in (initiation, restored):
-        either.set_region("e3", None)
-        either.refit(force=True)
-    np.testing.assert_array_equal(restored.optimistic(points), initiation.optimistic(points))

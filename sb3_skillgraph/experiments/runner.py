@@ -24,6 +24,7 @@ from sb3_skillgraph.experiments.console import versions
 from sb3_skillgraph.experiments.learners import ALGORITHMS, Learner
 from sb3_skillgraph.experiments.plan import RunSpec
 from sb3_skillgraph.experiments.run_folder import CONFIG, PROGRESS, STEPS, checkpoints, read_progress, take_checkpoint
+from sb3_skillgraph.experiments.training import plain
 
 DONE, ERROR, LOCK = "done.json", "error.txt", "lock"
 SECONDS = "time/seconds"
@@ -141,7 +142,7 @@ def has_other_settings(spec: RunSpec, out: Path) -> bool:
 def _settings(spec: RunSpec) -> str:
     """Return all that is set as JSON: what the plan says, and what is recommended where it is silent."""
     resolved = ALGORITHMS[spec.algorithm].resolve(spec.env_id, spec.arguments)
-    return json.dumps({**spec.as_plain(), "resolved": resolved}, default=lambda item: item.__name__)
+    return json.dumps({**spec.as_plain(), "resolved": resolved}, default=plain)
 
 
 def run(spec: RunSpec, out: Path) -> Outcome:

@@ -3,6 +3,7 @@
 import json
 import shutil
 import sys
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,7 @@ from sb3_skillgraph.experiments.run_folder import (
     stops,
     take_checkpoint,
 )
+from sb3_skillgraph.rules import PaperRules
 
 CHECKPOINT_EVERY = 10_000  # environment steps
 
@@ -137,4 +139,12 @@ def write_json(path: Path, document: dict[str, Any]) -> None:
 
 
 def _as_json(document: dict[str, Any]) -> str:
-    return json.dumps(document, indent=2, default=lambda item: item.__name__)
+    return json.dumps(document, indent=2, default=plain)
+
+
+def plain(item: Any) -> Any:
+    """Return a value of a configuration as JSON can have it: of a class its name, of rules their numbers.
+
+    :param item: the value
+    """
+    return asdict(item) if isinstance(item, PaperRules) else item.__name__

@@ -10,6 +10,7 @@ import yaml
 
 from sb3_skillgraph.agent import SkillGraphAgent
 from sb3_skillgraph.parts import OPTION_CLASSES
+from sb3_skillgraph.rules import PAPER
 
 FILE = Path(__file__).parent / "skillgraph.yml"
 
@@ -46,7 +47,7 @@ def load_hyperparams(env_id: str, path: Path = FILE, *, required: bool = False) 
 
 
 def check_hyperparams(values: dict[str, Any], origin: str) -> dict[str, Any]:
-    """Check names and numbers of hyperparameters, and put option classes in place of their names.
+    """Check names and numbers of hyperparameters, and put option classes and ``PAPER`` in place of their names.
 
     :param values: hyperparameters as YAML gives them
     :param origin: where they come from, for the messages
@@ -62,6 +63,10 @@ def check_hyperparams(values: dict[str, Any], origin: str) -> dict[str, Any]:
         if name not in OPTION_CLASSES:
             raise ValueError(f"{origin}: unknown option_class {name!r}; it is one of {', '.join(OPTION_CLASSES)}.")
         checked["option_class"] = OPTION_CLASSES[name]
+    if "rules" in checked:
+        if checked["rules"] != "paper":
+            raise ValueError(f"{origin}: unknown rules {checked['rules']!r}; there are those of the paper, rules: paper.")
+        checked = {**PAPER, **checked, "rules": PAPER["rules"]}
     return checked
 
 

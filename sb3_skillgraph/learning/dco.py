@@ -7,7 +7,6 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.torch_layers import create_mlp
 
-from sb3_skillgraph.graph import SkillGraph
 from sb3_skillgraph.memory.store import TransitionStore
 
 #: Environment steps between two embeddings, each of which takes half a second to learn.
@@ -128,33 +127,36 @@ class DCOSalience:
     smallest are proposed in turn.
 
     :param store: the agent's transitions
-    :param graph: the skill graph: its events lie all over what has been visited
     :param reach: environment steps that a pair lies at most apart
     :param n_pairs: pairs that an embedding is learned from
     """
 
-    def __init__(self, store: TransitionStore, graph: SkillGraph, reach: int, n_pairs: int = 20_000) -> None:
+    def __init__(self, store: TransitionStore, reach: int, n_pairs: int = 20_000) -> None:
         self.store = store
-        self.graph = graph
         self.reach = reach
         self.n_pairs = n_pairs
         self._ends: list[np.ndarray] = []
+        self._turn = 0
         self._learned_from = 0  # transitions
 
     def propose(self, rng: np.random.Generator) -> np.ndarray | None:
-        """Propose one end of the explored space or the other; None before there is any experience."""
-        if not len(self.store) or not self.graph.events:
+        """Propose one end of the explored space, then the other; None before there is any experience."""
+        if not len(self.store):
             return None
         if not self._ends or self.store.total >= self._learned_from + LEARN_EVERY:
             self._learned_from = self.store.total
-            values = learn_fiedler(self.store, self.reach, self.n_pairs, rng)(self.graph.centers)
-            self._ends = [self.graph.centers[i].copy() for i in (values.argmin(), values.argmax())]
-        return self._ends[rng.integers(len(self._ends))]
+            embedding = learn_fiedler(self.store, self.reach, self.n_pairs, rng)
+            rows = rng.integers(self.store.oldest, self.store.total, self.n_pairs)
+            points = self.store.column("achieved_goal", rows).astype(np.float64)
+            values = embedding(points)
+            self._ends = [points[i].copy() for i in (values.argmin(), values.argmax())]
+        self._turn = 1 - self._turn
+        return self._ends[self._turn]
 
     def get_state(self) -> dict[str, Any]:
         """Return what was learned last as plain data."""
-        return {"ends": self._ends, "learned_from": self._learned_from}
+        return {"ends": self._ends, "turn": self._turn, "learned_from": self._learned_from}
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Restore what :meth:`get_state` returned."""
-        self._ends, self._learned_from = list(state["ends"]), state["learned_from"]
+        self._ends, self._turn, self._learned_from = list(state["ends"]), state["turn"], state["learned_from"]

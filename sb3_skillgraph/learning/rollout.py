@@ -162,7 +162,7 @@ class Rollout:
         step = self.pending
         assert step is not None
         points = reached["achieved_goal"]
-        self.store.add(
+        rows = self.store.add(
             step.observation["observation"],
             step.observation["achieved_goal"],
             reached["observation"],
@@ -174,6 +174,10 @@ class Rollout:
             stuck,
         )
         self.held, self.hold_left, self.pending = step.held, step.hold_left, None
+        skills = self.runner.skills
+        for i, option in enumerate(step.state.option.tolist() if skills else ()):
+            if option in skills:
+                skills[option].replay.add_rows(rows[i : i + 1])
         for i in np.flatnonzero(step.state.steps == 1).tolist():
             self.witness.began(i, step.observation["achieved_goal"][i])
         self.state, runs = self.runner.advance(step.state, points, stuck)
@@ -185,8 +189,8 @@ class Rollout:
                 self.missions.discovered(i)
             run, mission = by_env.get(i), self.missions.current[i]
             assert mission is not None
-            if run is not None and mission.clean and not mission.random_walk:
-                self.witness.ended(run)
+            if run is not None and not mission.random_walk:
+                self.witness.ended(run, clean=mission.clean)
             if run is not None and run.success and mission.exploring and not mission.random_walk:
                 self._salient(point)
             over[i] = self.missions.observe(i, point, run, bool(dones[i]))

@@ -176,8 +176,14 @@ class Witness:
         """
         self._began[env] = point
 
-    def ended(self, run: Run) -> None:
-        """A run has ended: its record goes to the edge it belongs to, or, to a goal, to the model of untried walks."""
+    def ended(self, run: Run, *, clean: bool = True) -> None:
+        """A run has ended: its record goes to the edge it belongs to, or, to a goal, to the model of untried walks.
+
+        :param run: what became of it
+        :param clean: whether the policy acted without noise; else it tells nothing of what it can do
+        """
+        if not clean:
+            return
         graph = self.graph
         source, target = graph.index(run.event), graph.index(run.option)
         if source != NOWHERE and target != NOWHERE and source != target:

@@ -36,15 +36,6 @@ class Boundary(NamedTuple):
         )
         return np.exp(-self.gamma * squared) @ self.weights + self.intercept > 0.0
 
-    def box(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the corners of a box outside which no point lies inside, each of shape ``(goal_dim,)``.
-
-        Every point inside has a support vector near enough for all weights together to reach the threshold with it.
-        """
-        total, threshold = float(self.weights[self.weights > 0].sum()), -self.intercept
-        reach = np.inf if threshold <= 0.0 else np.sqrt(max(np.log(total / threshold), 0.0) / self.gamma)
-        return self.support.min(axis=0) - reach, self.support.max(axis=0) + reach
-
 
 class InitiationSet:
     """Where an option can start, twice: optimistic and pessimistic.
@@ -61,7 +52,6 @@ class InitiationSet:
         self.radius = radius
         self.successes: deque[np.ndarray] = deque(maxlen=N_SUCCESSES)
         self.failures: deque[np.ndarray] = deque(maxlen=N_FAILURES)
-        self.regions: dict[str, np.ndarray] = {}
         self.optimistic_boundaries: list[Boundary] = []
         self.pessimistic_boundaries: list[Boundary] = []
         self.core: np.ndarray | None = None
@@ -89,21 +79,6 @@ class InitiationSet:
         self.failures.append(np.asarray(start, dtype=np.float64))
         self._n_news += 1
 
-    def set_region(self, name: str, points: np.ndarray | None) -> bool:
-        """Count a whole region as a place to start from, or no longer.
-
-        :param name: name of the region (an event's id)
-        :param points: points that stake it out, shape ``(n, goal_dim)``; None to take it away
-        :return: whether that changes anything
-        """
-        changed = (name in self.regions) != (points is not None)
-        if points is None:
-            self.regions.pop(name, None)
-        else:
-            self.regions[name] = np.asarray(points, dtype=np.float64)
-        self._n_news += changed
-        return changed
-
     def refit(self, force: bool = False) -> bool:
         """Fit the set to its examples, if enough of them are new.
 
@@ -124,7 +99,7 @@ class InitiationSet:
     def _fit(self) -> None:
         from sklearn.svm import SVC
 
-        positives = np.concatenate([*self.successes, *self.regions.values()])
+        positives = np.concatenate(self.successes)
         negatives = self._standing_failures()
         # A floor under the kernel's width: a handful of points in one spot still describe a place, not a point.
         gamma = 1.0 / (positives.shape[1] * max(float(positives.var()), (0.5 * self.radius) ** 2))
@@ -181,7 +156,6 @@ class InitiationSet:
         return {
             "successes": list(self.successes),
             "failures": list(self.failures),
-            "regions": self.regions,
             "optimistic": [boundary._asdict() for boundary in self.optimistic_boundaries],
             "pessimistic": [boundary._asdict() for boundary in self.pessimistic_boundaries],
             "core": self.core,
@@ -192,7 +166,6 @@ class InitiationSet:
         """Restore what :meth:`get_state` returned."""
         self.successes = deque(state["successes"], maxlen=N_SUCCESSES)
         self.failures = deque(state["failures"], maxlen=N_FAILURES)
-        self.regions = dict(state["regions"])
         self.optimistic_boundaries = [Boundary(**boundary) for boundary in state["optimistic"]]
         self.pessimistic_boundaries = [Boundary(**boundary) for boundary in state["pessimistic"]]
         self.core = state["core"]

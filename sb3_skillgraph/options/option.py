@@ -12,8 +12,8 @@ from sb3_skillgraph.memory.replay import OptionReplay, OptionRule
 from sb3_skillgraph.options.initiation import InitiationSet
 from sb3_skillgraph.options.numpy_actor import NumpyActor
 
-RECORD_LENGTH = 10  # runs that count: an option's policy changes, and old runs speak of an old policy
-EFFECTS_LENGTH = 50
+#: States kept of those in which successful runs ended.
+EFFECTS_LENGTH = 200
 
 
 class Option:
@@ -49,7 +49,7 @@ class Option:
         self.mature = False
         self.n_successes = 0
         self.n_runs = 0
-        self.record: deque[bool] = deque(maxlen=RECORD_LENGTH)
+        self.n_steps = 0  # of all runs together
         self.effects: deque[np.ndarray] = deque(maxlen=EFFECTS_LENGTH)
         self._actor: NumpyActor | None = None
 
@@ -97,37 +97,32 @@ class Option:
         assert center is not None, f"The target of option {self.id!r} has no centre to aim at."
         return np.asarray(center)
 
-    def success_rate(self, prior: tuple[float, float] = (0.0, 0.0)) -> float:
-        """Return the share of recent runs that succeeded.
+    @property
+    def success_rate(self) -> float:
+        """Share of its runs that succeeded; 0 before the first."""
+        return self.n_successes / max(self.n_runs, 1)
 
-        :param prior: pseudo-counts of successes and of failures (0 with neither them nor runs)
-        :return: between 0 and 1
-        """
-        successes, failures = prior
-        n = len(self.record) + successes + failures
-        return (sum(self.record) + successes) / n if n else 0.0
-
-    def succeeded(self, path: np.ndarray, end: np.ndarray, *, own: bool = True) -> None:
+    def succeeded(self, path: np.ndarray, end: np.ndarray, steps: int) -> None:
         """Learn from a run that reached the termination set.
 
         :param path: states from the start of the run to before its end, shape ``(n, goal_dim)``
         :param end: the state it ended in, shape ``(goal_dim,)``
-        :param own: False if another option's run happened to lead here: it shows the way, but is no run of ours
+        :param steps: environment steps it took
         """
         self.n_successes += 1
+        self.n_runs += 1
+        self.n_steps += steps
         self.initiation.add_success(path)
-        if own:
-            self.n_runs += 1
-            self.record.append(True)
-            self.effects.append(np.asarray(end, dtype=np.float64))
+        self.effects.append(np.asarray(end, dtype=np.float64))
 
-    def failed(self, start: np.ndarray | None) -> None:
+    def failed(self, start: np.ndarray | None, steps: int) -> None:
         """Learn from a run that failed.
 
         :param start: the state it began in, shape ``(goal_dim,)``; None if that was not to blame: the agent got stuck
+        :param steps: environment steps it took
         """
         self.n_runs += 1
-        self.record.append(False)
+        self.n_steps += steps
         if start is not None:
             self.initiation.add_failure(start)
 
@@ -139,7 +134,7 @@ class Option:
             "mature": self.mature,
             "n_successes": self.n_successes,
             "n_runs": self.n_runs,
-            "record": list(self.record),
+            "n_steps": self.n_steps,
             "effects": list(self.effects),
             "initiation": self.initiation.get_state(),
             "n_updates": self.learner._n_updates,
@@ -148,8 +143,7 @@ class Option:
     def set_state(self, state: dict[str, Any]) -> None:
         """Restore what :meth:`get_state` returned."""
         self.mature = state["mature"]
-        self.n_successes, self.n_runs = state["n_successes"], state["n_runs"]
-        self.record = deque(state["record"], maxlen=RECORD_LENGTH)
+        self.n_successes, self.n_runs, self.n_steps = state["n_successes"], state["n_runs"], state["n_steps"]
         self.effects = deque(state["effects"], maxlen=EFFECTS_LENGTH)
         self.initiation.set_state(state["initiation"])
         self.learner._n_updates = state["n_updates"]

@@ -1,14 +1,11 @@
 """Walks: the options that share one goal-conditioned policy, the walker."""
 
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_skillgraph.events import Event
-
-if TYPE_CHECKING:
-    from sb3_skillgraph.runner import Runner
 
 
 class Walk:
@@ -20,10 +17,10 @@ class Walk:
     :param target: id of the event it leads to
     :param termination: the event it leads to, where it ends
     :param learner: the SB3 model of the walker, which all walks share
-    :param runner: what runs it
+    :param runner: the agent's :class:`~sb3_skillgraph.runner.Runner`, which runs it
     """
 
-    def __init__(self, id: str, termination: Event, learner: OffPolicyAlgorithm, runner: "Runner") -> None:
+    def __init__(self, id: str, termination: Event, learner: OffPolicyAlgorithm, runner: Any) -> None:
         self.id = id
         self.target = termination.id
         self.termination = termination

@@ -23,7 +23,7 @@ NEAREST = 4
 
 
 class EventLink(NamedTuple):
-    """A walk from one event to another.
+    """A walk from one event to another; by the paper's rules, options one after the other.
 
     :param source: id of the event it is begun in
     :param target: id of the event it leads to
@@ -38,11 +38,14 @@ class EventLink(NamedTuple):
 
 
 def event_links(agent: SkillGraphAgent) -> list[EventLink]:
-    """Return what the agent expects of its walks.
+    """Return what the agent expects of the ways from event to event.
 
     :param agent: the agent
-    :return: one link for each edge of the graph
+    :return: one link for each edge of the graph; by the paper's rules, for each two events that options alone join
     """
+    if agent.rules is not None:
+        links = (agent.parts.policy.links_from(event.id) for event in agent.events)
+        return [EventLink(*link) for some in links for link in some]
     graph, walks = agent.graph, agent.parts.planner.choice_model.walks()
     columns = (walks.source.tolist(), walks.target.tolist(), walks.success(EXPECTED).tolist(), walks.steps.tolist())
     return [EventLink(graph.id(u), graph.id(v), p, steps) for u, v, p, steps in zip(*columns, strict=True)]
@@ -81,7 +84,8 @@ def plot_skill_graph(agent: SkillGraphAgent, geometry: MazeGeometry | None = Non
     _draw_links(axes, agent, near_links(event_links(agent)))
     _draw_events(axes, agent)
     n_salient = sum(event.salient for event in agent.events)
-    axes.set_title(f"Skill graph: {len(agent.events)} events, {n_salient} of them salient; {agent.graph.edges.size} edges")
+    n_edges = agent.graph.summary()["edges"]
+    axes.set_title(f"Skill graph: {len(agent.events)} events, {n_salient} of them salient; {n_edges} edges")
     _draw_key(axes)
     return axes
 
@@ -96,7 +100,7 @@ def _draw_links(axes: Axes, agent: SkillGraphAgent, links: list[EventLink]) -> N
     axes.add_collection(LineCollection(lines, colors=colors, linewidths=1.1, zorder=figures.Z_LINK))
     figure = axes.get_figure(root=False)
     assert figure is not None
-    figure.colorbar(ScalarMappable(scale, _LINKS), ax=axes, shrink=0.6, label="success expected of a walk")
+    figure.colorbar(ScalarMappable(scale, _LINKS), ax=axes, shrink=0.6, label="success expected")
 
 
 def _draw_events(axes: Axes, agent: SkillGraphAgent) -> None:
@@ -112,6 +116,6 @@ def _draw_key(axes: Axes) -> None:
     handles = [
         Line2D([], [], markersize=5, markerfacecolor=figures.EVENT, label="landmark", **dot),  # type: ignore[arg-type]
         Line2D([], [], markersize=8, markerfacecolor=figures.EFFECT, label="salient event", **dot),  # type: ignore[arg-type]
-        Line2D([], [], color=_LINKS(0.9), linewidth=1.5, label="walk between two events (one way at least)"),
+        Line2D([], [], color=_LINKS(0.9), linewidth=1.5, label="options from event to event (one way at least)"),
     ]
     axes.legend(handles=handles, loc="upper center", bbox_to_anchor=(0.5, -0.09), ncols=3, fontsize=8, frameon=False)

@@ -1,15 +1,12 @@
 """The skill graph as a high level for an :class:`~sb3_skillgraph.OptionsEnv` (sections 3.2.4, 3.3)."""
 
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 
 from sb3_skillgraph.choices import PESSIMISTIC
 from sb3_skillgraph.smdp.actions import WalkActions
 from sb3_skillgraph.smdp.options_env import OptionsEnv
-
-if TYPE_CHECKING:
-    from sb3_skillgraph.agent import SkillGraphAgent
 
 
 class GraphPolicy:
@@ -19,12 +16,12 @@ class GraphPolicy:
     It has SB3's ``predict`` and so is exchangeable with :class:`~sb3_skillgraph.SMDPQLearning` on the same environment. What
     has happened in the episode it takes from the environment, which keeps the agent's record of it.
 
-    :param agent: plans over its graph
+    :param agent: a :class:`~sb3_skillgraph.SkillGraphAgent`, which plans over its graph
     :param env: lifted by the agent's options; predictions are for where it stands
     :raises ValueError: if the environment's options are not the agent's
     """
 
-    def __init__(self, agent: "SkillGraphAgent", env: OptionsEnv) -> None:
+    def __init__(self, agent: Any, env: OptionsEnv) -> None:
         if not isinstance(env.actions, WalkActions) or env.actions.runner is not agent.parts.runner:
             raise ValueError("The environment's options are not this agent's: give it OptionsEnv(env, agent.options).")
         self.env = env

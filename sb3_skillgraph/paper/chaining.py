@@ -1,0 +1,157 @@
+"""Deep skill chaining: options learned backwards from an event until one can start where it must (sections 2.2, 3.2.5)."""
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+
+from sb3_skillgraph.events import Event, TerminationSet
+from sb3_skillgraph.options.option import Option
+from sb3_skillgraph.paper.graph import PaperGraph
+
+MakeOption = Callable[[str, str, TerminationSet], Option]
+
+
+@dataclass
+class SkillChain:
+    """Options that lead from one event to another, the last step first.
+
+    :param source: id of the event where it must be possible to start
+    :param target: id of the event it leads to
+    :param options: ids of its options: the first (the root) ends in the target event, each next one in the initiation set
+        of the one before
+    :param complete: whether an option of it can be started all over the source event (section A.3)
+    """
+
+    source: str
+    target: str
+    options: list[str] = field(default_factory=list)
+    complete: bool = False
+
+
+class DeepSkillChaining:
+    """Opens chains, lets their options gestate, and grows them until they are complete.
+
+    :param graph: the skill graph, which mature options join
+    :param make_option: makes a gestating option of an id for a target id and a termination set
+    :param gestation_period: successes an option needs to mature
+    """
+
+    def __init__(self, graph: PaperGraph, make_option: MakeOption, gestation_period: int) -> None:
+        self.graph = graph
+        self.make_option = make_option
+        self.gestation_period = gestation_period
+        self.chains: list[SkillChain] = []
+        self.options: dict[str, Option] = {}  # gestating ones too
+
+    def open_chain(self, source: Event, target: Event) -> SkillChain:
+        """Begin the chain between two events, unless there is one.
+
+        :param source: where it must be possible to start
+        :param target: where it must lead
+        """
+        for chain in self.chains:
+            if (chain.source, chain.target) == (source.id, target.id):
+                return chain
+        chain = SkillChain(source.id, target.id)
+        self.chains.append(chain)
+        self._grow(chain, target.id, target)
+        return chain
+
+    def _grow(self, chain: SkillChain, target: str, termination: TerminationSet) -> None:
+        option = self.make_option(f"o{len(self.options)}", target, termination)
+        self.options[option.id] = option
+        chain.options.append(option.id)
+
+    def leading_to(self, event: str) -> list[SkillChain]:
+        """Return the chains that lead to an event, those with something left to learn first.
+
+        :param event: its id
+        """
+        return sorted((chain for chain in self.chains if chain.target == event), key=lambda chain: chain.complete)
+
+    def admissible(self, chain: SkillChain, point: np.ndarray) -> Option | None:
+        """Return the earliest option of a chain, counted from its target, that can start at a point.
+
+        A gestating option may start anywhere: that is how it finds out where it should.
+
+        :param chain: the chain
+        :param point: where the agent stands, shape ``(goal_dim,)``
+        """
+        for option in (self.options[id] for id in chain.options):
+            startable = not option.mature or bool(option.initiation.optimistic(point[None])[0])
+            if startable and not option.terminates(point):
+                return option
+        return None
+
+    # -- what runs teach ----------------------------------------------------------------------------------------------
+
+    def succeeded(self, option: Option, path: np.ndarray, end: np.ndarray, steps: int) -> None:
+        """Let an option learn from a run that reached its termination set.
+
+        :param option: the option
+        :param path: the states of the run before its end, its start first, shape ``(n, goal_dim)``
+        :param end: the state it ended in, shape ``(goal_dim,)``
+        :param steps: environment steps it took
+        """
+        option.succeeded(path, end, steps)
+        self._learned(option)
+
+    def failed(self, option: Option, start: np.ndarray | None, steps: int) -> None:
+        """Let an option learn from a run that failed.
+
+        :param option: the option
+        :param start: the state it began in, shape ``(goal_dim,)``; None if that was not to blame: the agent got stuck
+        :param steps: environment steps it took
+        """
+        option.failed(start, steps)
+        self._learned(option)
+
+    def _learned(self, option: Option) -> None:
+        """Fit where the option can start, let it mature, and see what its chain still needs."""
+        refitted = option.initiation.refit(force=not option.mature)
+        if not option.mature:
+            if option.n_successes < self.gestation_period:
+                return
+            option.mature = True
+            self.graph.add_option(option)
+        self.graph.refresh(option, refitted)
+        for chain in self.chains:
+            self._check(chain)
+
+    def _check(self, chain: SkillChain) -> None:
+        """Close a chain when one of its options can start all over the source; grow it when its last option is mature."""
+        if chain.complete:
+            return
+        chain.complete = any(self.graph.nx.has_edge(chain.source, id) for id in chain.options)
+        last = self.options[chain.options[-1]]
+        if last.mature and not chain.complete:
+            self._grow(chain, last.id, last)
+
+    def begin_inside(self, chain: SkillChain, option: Option) -> None:
+        """Let a new chain's root start where another option can: it only has the last stretch to learn (section 3.3, b).
+
+        :param chain: the chain
+        :param option: the option whose initiation set holds the chain's target
+        """
+        root = self.options[chain.options[0]]
+        root.initiation.set_state(option.initiation.get_state())
+        root.mature = True
+        self.graph.add_option(root)
+        self.graph.refresh(root, refitted=True)
+
+    # -- saving -------------------------------------------------------------------------------------------------------
+
+    def get_state(self) -> dict[str, Any]:
+        """Return the chains as plain data; options are saved by their owner."""
+        return {"chains": [asdict(chain) for chain in self.chains]}
+
+    def set_state(self, state: dict[str, Any], options: list[Option]) -> None:
+        """Restore what :meth:`get_state` returned.
+
+        :param state: the state
+        :param options: the restored options
+        """
+        self.chains = [SkillChain(**spec) for spec in state["chains"]]
+        self.options = {option.id: option for option in options}

@@ -1,0 +1,173 @@
+"""What the agent is about while it learns, by the paper: events found, targets picked (sections 3.2.1, 3.2.2, A.1, A.3)."""
+
+import math
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from sb3_skillgraph.edges import NOWHERE
+from sb3_skillgraph.events import Event
+from sb3_skillgraph.learning.missions import Mission
+from sb3_skillgraph.learning.salience import Salience
+from sb3_skillgraph.paper.chaining import DeepSkillChaining
+from sb3_skillgraph.paper.graph import PaperGraph
+from sb3_skillgraph.rules import PaperRules
+from sb3_skillgraph.runner import Run
+
+
+class PaperMissions:
+    """Finds salient events, and picks one of all of them as the target, each as likely.
+
+    :param graph: the skill graph
+    :param chaining: the chains
+    :param salience: proposes salient events
+    :param rules: the paper's numbers
+    :param exploration_steps: environment steps of a random walk, where there is no event to go to
+    :param rng: random generator
+    """
+
+    def __init__(
+        self,
+        graph: PaperGraph,
+        chaining: DeepSkillChaining,
+        salience: Salience,
+        rules: PaperRules,
+        exploration_steps: int,
+        rng: np.random.Generator,
+    ) -> None:
+        self.graph = graph
+        self.chaining = chaining
+        self.salience = salience
+        self.rules = rules
+        self.exploration_steps = exploration_steps
+        self.rng = rng
+        self.pinned: np.ndarray | None = None  # the goal that adaptation is for
+        self.current: list[Mission | None] = []
+        self.n_episodes = 0
+        self.last_accepted = 0  # episode
+        self.last_rejected: int | None = None  # episode, if nothing was accepted at the last attempt
+        self.newest = ""  # id of the event accepted last
+
+    def cut(self, n_envs: int) -> None:
+        """Forget what the environments were in the middle of."""
+        self.current = [None] * n_envs
+
+    def of(self, env: int, point: np.ndarray, warm_up: bool) -> Mission:
+        """Return an environment's mission; a new one where the last is over.
+
+        :param env: which environment
+        :param point: where the agent stands, shape ``(goal_dim,)``
+        :param warm_up: whether to walk at random, whatever there is to do
+        """
+        if not self.graph.events:
+            self.graph.add_event(point)  # where it starts: beta_0 of section 3.2.7
+        mission = self.current[env]
+        if mission is None:
+            mission = self._random_walk(point) if warm_up else self._choose(point)
+            self.current[env] = mission
+        return mission
+
+    def observe(self, env: int, point: np.ndarray, run: Run | None, done: bool) -> bool:
+        """Learn that a step was taken.
+
+        :param env: which environment
+        :param point: where the agent has got to, shape ``(goal_dim,)``
+        :param run: not used
+        :param done: whether the episode is over
+        :return: whether the agent is to do something else now
+        """
+        mission = self.current[env]
+        assert mission is not None
+        mission.explore_steps -= mission.exploring
+        near = math.dist(point.tolist(), mission.goal.tolist()) <= self.graph.radius
+        over = done or (mission.explore_steps <= 0 if mission.exploring else near)
+        if over:
+            self.current[env] = None
+        self.n_episodes += done
+        return over
+
+    def discovered(self, env: int) -> None:
+        """Nothing follows from it."""
+
+    # -- choosing -----------------------------------------------------------------------------------------------------
+
+    def _choose(self, point: np.ndarray) -> Mission:
+        """Pick a target (section 3.2.2); before that look for new ones, where it is time to."""
+        if self.pinned is not None:
+            target = self._pinned_event(self.pinned)
+            return Mission(target.center.copy()) if not target.holds(point) else self._random_walk(point)
+        if self._is_due():
+            self._attempt()
+        for chain in list(self.chaining.chains):
+            if chain.complete:  # then the way back is learned, A.3
+                self.chaining.open_chain(self._event(chain.target), self._event(chain.source))
+        events = [event for event in self.graph.events if not event.holds(point)]
+        if not events:
+            return self._random_walk(point)
+        return Mission(events[self.rng.integers(len(events))].center.copy())
+
+    def _random_walk(self, point: np.ndarray) -> Mission:
+        return Mission(point.astype(np.float64), explore_steps=self.exploration_steps, exploring=True)
+
+    def _event(self, id: str) -> Event:
+        return self.graph.events[self.graph.index(id)]
+
+    def _pinned_event(self, goal: np.ndarray) -> Event:
+        """Return the event that few-shot adaptation is for; a new one gets its chain (section 3.3, cases b and c)."""
+        for event in self.graph.events:
+            if np.array_equal(event.center, goal):
+                return event
+        around = self.graph.holding(goal)
+        event = self._add(goal)
+        if around:
+            self.chaining.begin_inside(self.chaining.leading_to(event.id)[0], around[0])
+        return event
+
+    # -- salient events -----------------------------------------------------------------------------------------------
+
+    def _is_due(self) -> bool:
+        """Tell whether it is time to look for salient events: one of the three conditions of A.1.2 holds."""
+        if self.last_rejected is not None:
+            return self.n_episodes - self.last_rejected >= self.rules.retry_after
+        joined = not self.newest or self.newest in self.graph.joined()
+        return joined or self.n_episodes - self.last_accepted >= self.rules.salient_event_freq
+
+    def _attempt(self) -> None:
+        """Look for a pair of salient events; each may be rejected."""
+        proposals = [self.salience.propose(self.rng) for _ in range(2)]
+        accepted = [self._add(point).id for point in proposals if point is not None and not self.is_redundant(point)]
+        if accepted:
+            self.last_accepted, self.last_rejected, self.newest = self.n_episodes, None, accepted[-1]
+        else:
+            self.last_rejected = self.n_episodes
+
+    def is_redundant(self, point: np.ndarray) -> bool:
+        """Tell whether an event there would teach nothing new: it lies in an event, or where an option can start (A.1.1).
+
+        :param point: shape ``(goal_dim,)``
+        """
+        return self.graph.locate(point) != NOWHERE or bool(self.graph.holding(point))
+
+    def _add(self, center: np.ndarray) -> Event:
+        """Add an event, and open the chain to it from the event of the graph that is nearest to it (3.2.3, 3.2.5)."""
+        joined = self.graph.joined()
+        known = [event for event in self.graph.events if event.id in joined]
+        event = self.graph.events[self.graph.add_event(center)]
+        if known:
+            source = min(known, key=lambda other: math.dist(other.center, event.center))
+            self.chaining.open_chain(source, event)
+        return event
+
+    # -- saving -------------------------------------------------------------------------------------------------------
+
+    def get_state(self) -> dict[str, Any]:
+        """Return missions and counters as plain data."""
+        names = ("pinned", "n_episodes", "last_accepted", "last_rejected", "newest")
+        current = [None if mission is None else asdict(mission) for mission in self.current]
+        return {"current": current, **{name: getattr(self, name) for name in names}}
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Restore what :meth:`get_state` returned."""
+        vars(self).update(state)
+        self.current = [None if spec is None else Mission(**spec) for spec in state["current"]]

@@ -1,0 +1,117 @@
+"""The parts of an agent that does as the paper does, and how they are put together (Figure 10)."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+
+from sb3_skillgraph import persistence
+from sb3_skillgraph.goal_env import GoalSpec
+from sb3_skillgraph.options.option import Option
+from sb3_skillgraph.paper.chaining import DeepSkillChaining
+from sb3_skillgraph.paper.graph import PaperGraph
+from sb3_skillgraph.paper.missions import PaperMissions
+from sb3_skillgraph.paper.policy import PaperPolicy
+from sb3_skillgraph.paper.witness import PaperWitness
+from sb3_skillgraph.parts import Common, Parts, find_salience, horizon
+from sb3_skillgraph.plan import Plan
+from sb3_skillgraph.planning import Planner
+from sb3_skillgraph.runner import Runner, RunnerState
+from sb3_skillgraph.walk_model import WalkModel
+
+
+@dataclass
+class PaperParts(Parts):
+    """What a :class:`~sb3_skillgraph.SkillGraphAgent` is made of with ``**PAPER``.
+
+    The walker is there, since every SB3 algorithm has a policy, but it neither acts nor learns.
+    """
+
+    chaining: DeepSkillChaining
+    policy: PaperPolicy
+
+    @classmethod
+    def build(cls, agent: OffPolicyAlgorithm, spec: GoalSpec, arguments: dict[str, Any]) -> "PaperParts":
+        """Put an agent together.
+
+        :param agent: gives environment, spaces, SB3's arguments and device
+        :param spec: lengths of observation, goal and action
+        :param arguments: the agent's keyword arguments
+        """
+        common = Common.build(agent, spec, arguments, {"shared": 0.0})  # options learn from their own experience
+        rng, view_name, view, store, factory, walker, radius = common
+        rules = arguments["rules"]
+        graph = PaperGraph(spec.goal_dim, radius)
+        chaining = DeepSkillChaining(graph, factory.make, rules.gestation_period)
+        policy = PaperPolicy(graph, chaining, rules.timeout)
+        model = WalkModel()
+        planner = Planner(graph, model, horizon(agent.env))  # never asked: the rules choose
+        runner = Runner(graph, planner, walker.actor, view, policy)
+        salience = find_salience(arguments, graph, store, agent)
+        missions: Any = PaperMissions(graph, chaining, salience, rules, arguments["exploration_steps"], rng)
+        witness: Any = PaperWitness(graph, chaining, agent.n_envs)
+        rollout = common.rollout(runner, missions, witness, arguments)
+        known = (rng, view_name, factory, store, walker, graph, model, planner, runner, missions, witness, rollout)
+        return cls(*known, chaining, policy)
+
+    def options(self) -> list[Any]:
+        """Return all options, gestating ones too, in the order of their making."""
+        return list(self.chaining.options.values())
+
+    def plan(self, state: RunnerState, point: np.ndarray, goal: np.ndarray) -> Plan:
+        """Tell how the agent goes about a goal.
+
+        :param state: of one environment, advanced to this step
+        :param point: where the agent stands, shape ``(goal_dim,)``
+        :param goal: shape ``(goal_dim,)``
+        """
+        return self.policy.plan(state, point, goal)
+
+    def learners(self) -> list[Option]:
+        """Return the options that run now: each learns from its own runs."""
+        running = dict.fromkeys(self.rollout.state.option.tolist())
+        return [self.chaining.options[id] for id in running if id in self.chaining.options]
+
+    def get_state(self) -> dict[str, Any]:
+        """Return what has been learned, the options' networks too, as plain data."""
+        options = [
+            {"record": option.get_state(), "parameters": persistence.parameters(option.learner)}
+            for option in self.chaining.options.values()
+        ]
+        return {
+            "horizon": self.planner.horizon,
+            "graph": self.graph.get_state(),
+            "chaining": self.chaining.get_state(),
+            "options": options,
+        }
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Restore what :meth:`get_state` returned."""
+        graph: Any = self.graph
+        self.planner.horizon = state["horizon"]
+        graph.set_state(state["graph"])
+        options: dict[str, Option] = {}
+        for spec in state["options"]:  # an option's parent was made before it
+            record = spec["record"]
+            event = graph.index(record["target"])
+            termination = graph.events[event] if event >= 0 else options[record["target"]]
+            option = self.factory.make(record["id"], record["target"], termination)
+            option.set_state(record)
+            persistence.set_parameters(option.learner, spec["parameters"], True, self.factory.device)
+            options[option.id] = option
+        self.chaining.set_state(state["chaining"], list(options.values()))
+        graph.set_options(state["graph"]["options"], options)
+
+    def get_experience(self) -> dict[str, Any]:
+        """Return what goes with the replay buffer: the transitions, and which of them are which option's own."""
+        rows = {id: option.replay.get_state()["rows"] for id, option in self.chaining.options.items()}
+        return {**super().get_experience(), "rows": rows}
+
+    def set_experience(self, state: dict[str, Any]) -> None:
+        """Restore what :meth:`get_experience` returned."""
+        transitions = dict(state)
+        rows = transitions.pop("rows", {})
+        super().set_experience(transitions)
+        for id, option in self.chaining.options.items():
+            option.replay.set_state({"rows": rows[id]})

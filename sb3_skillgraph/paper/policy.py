@@ -1,0 +1,169 @@
+"""Which option runs, by the paper: the planner's inside the graph, the policy over options outside (3.2.3, 3.2.4, A.6)."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from sb3_skillgraph.options.option import Option
+from sb3_skillgraph.paper.chaining import DeepSkillChaining
+from sb3_skillgraph.paper.graph import PaperGraph
+from sb3_skillgraph.plan import Plan, Status
+from sb3_skillgraph.planning import DIRECT, GOAL
+from sb3_skillgraph.runner import Chosen, RunnerState
+
+
+class Way(NamedTuple):
+    """A way through the graph.
+
+    :param vertices: ids, an option that can start first
+    :param at_goal: whether the goal is reached at the end; else that is the vertex nearest to it
+    """
+
+    vertices: list[str]
+    at_goal: bool
+
+
+class PaperPolicy:
+    """Chooses options.
+
+    Inside the graph, where a path leads to the goal, it is the first option of the cheapest one. Else it is that of the path
+    to the event nearest to the goal; and from there on, and outside the graph, the policy over options of deep skill
+    chaining. A.6 leaves open which that is; here it is the earliest admissible option of the chains that lead to the goal's
+    event, as in the authors' later work (Bagaria et al. 2021), and for a goal without a chain the option that leads nearest
+    to it.
+
+    :param graph: the skill graph
+    :param chaining: the chains
+    :param timeout: environment steps an option may run
+    """
+
+    def __init__(self, graph: PaperGraph, chaining: DeepSkillChaining, timeout: int) -> None:
+        self.graph = graph
+        self.chaining = chaining
+        self.timeout = timeout
+
+    @property
+    def skills(self) -> dict[str, Option]:
+        """The options that have a network of their own, gestating ones too."""
+        return self.chaining.options
+
+    def choose(self, state: RunnerState, i: int, point: np.ndarray, goal: np.ndarray, stance: float) -> Chosen:
+        """Choose the option that runs next.
+
+        :param state: the state before the step
+        :param i: the environment
+        :param point: where its agent stands, shape ``(goal_dim,)``
+        :param goal: where it is to go, same shape
+        :param stance: not used
+        """
+        way = self.way(state, i, point, goal)
+        option = self.outside(point, goal) if way is None else self.skills[way.vertices[0]]
+        event = self.graph.id(self.graph.locate(point))
+        if option is None:
+            return Chosen(DIRECT, event, goal, self.timeout)
+        return Chosen(option.id, event, option.subgoal, self.timeout)
+
+    def way(self, state: RunnerState, i: int, point: np.ndarray, goal: np.ndarray) -> Way | None:
+        """Return the way that is planned: to the goal, else to the event nearest to it; None if there is none to go.
+
+        Whoever has been at the nearest event and left it from there has left the graph.
+
+        :param state: tells the runs so far
+        :param i: the environment
+        :param point: where its agent stands, shape ``(goal_dim,)``
+        :param goal: shape ``(goal_dim,)``
+        """
+        running = str(state.option[i])
+        able = [running] if running in self.graph.options else [o.id for o in self.graph.startable(point) if not running]
+        costs, ways = self.graph.ways_from(able)
+        ends = [vertex for vertex in self._targets(goal) if vertex in costs]
+        if ends:
+            return Way(ways[min(ends, key=lambda vertex: costs[vertex] + self._runs(vertex))], at_goal=True)
+        here = self.graph.id(self.graph.locate(point))
+        known = [event for event in self.graph.events if event.id in costs or event.id == here]
+        if not known:
+            return None
+        nearest = min(known, key=lambda event: math.dist(event.center, goal)).id
+        if nearest == here or nearest in state.run_event[i]:
+            return None
+        return Way(ways[nearest], at_goal=False)
+
+    def _runs(self, vertex: str) -> float:
+        """Return how often an option at the end of a path is to be run; no edge says so."""
+        return 1.0 / max(self.skills[vertex].success_rate, 1e-3) if vertex in self.skills else 0.0
+
+    def _targets(self, goal: np.ndarray) -> list[str]:
+        """Return the vertices at which a goal is reached, or from which a chain that has begun inside goes on to it."""
+        target = self.graph.id(self.graph.locate(goal))
+        chains = self.chaining.leading_to(target) if target else []
+        return [*self.graph.inside(goal), *(chain.options[0] for chain in chains if chain.options[0] in self.graph.options)]
+
+    def outside(self, point: np.ndarray, goal: np.ndarray) -> Option | None:
+        """Return what the policy over options of deep skill chaining runs; None if there are no options yet.
+
+        :param point: where the agent stands, shape ``(goal_dim,)``
+        :param goal: where it is to go, same shape
+        """
+        for chain in self.chaining.leading_to(self.graph.id(self.graph.locate(goal))):
+            option = self.chaining.admissible(chain, point)
+            if option is not None:
+                return option
+        options = [option for option in self.skills.values() if not option.terminates(point)]
+        able = [option for option in options if not option.mature or option.initiation.optimistic(point[None])[0]]
+        return min(able or options, key=lambda option: math.dist(option.subgoal, goal), default=None)
+
+    # -- plans for people ---------------------------------------------------------------------------------------------
+
+    def plan(self, state: RunnerState, point: np.ndarray, goal: np.ndarray) -> Plan:
+        """Tell how the agent goes about a goal.
+
+        :param state: of one environment, advanced to this step
+        :param point: where the agent stands, shape ``(goal_dim,)``
+        :param goal: shape ``(goal_dim,)``
+        :return: the plan; its path is empty where the policy over options decides
+        """
+        way, status = self.way(state, 0, point, goal), self._status(goal)
+        if way is None:
+            return PaperPlan(status, (), math.inf, 0.0)
+        if not way.at_goal:
+            return PaperPlan(status, tuple(way.vertices), math.inf, 0.0)
+        return PaperPlan(status, (*way.vertices, GOAL), *self._worth(way.vertices))
+
+    def _worth(self, vertices: list[str]) -> tuple[float, float]:
+        """Return the environment steps until every option on a way has succeeded, and how likely each does at once."""
+        options = [self.skills[vertex] for vertex in vertices if vertex in self.skills]
+        steps = sum(option.n_steps / max(option.n_successes, 1) for option in options)
+        return steps, math.prod(option.success_rate for option in options)
+
+    def links_from(self, event: str) -> list[tuple[str, str, float, float]]:
+        """Return the ways from an event to others that pass no third one.
+
+        :param event: its id
+        :return: for each, both ids, its probability and its environment steps
+        """
+        links = []
+        for target, way in self.graph.ways_past_no_event(event).items():
+            steps, probability = self._worth(way)
+            links.append((event, target, probability, steps))
+        return links
+
+    def _status(self, goal: np.ndarray) -> Status:
+        if self.graph.inside(goal):
+            return "in_graph"
+        return "in_initiation_set" if self.graph.holding(goal) else "outside"
+
+
+class PaperPlan(Plan):
+    """A plan over the paper's graph: every vertex on the way, options and events."""
+
+    def __str__(self) -> str:
+        if not self.path:
+            return f"The goal is {self.status.replace('_', ' ')}: the policy over options goes there."
+        way = ", ".join(self.path[: -1 if self.path[-1] == GOAL else None])
+        if self.path[-1] != GOAL:
+            return f"The goal is {self.status.replace('_', ' ')}: go near it by way of {way}; the policy over options goes on."
+        return (
+            f"The goal is {self.status.replace('_', ' ')}: go there by way of {way}, about {self.expected_steps:.0f} steps, "
+            f"success {self.success_probability:.0%}."
+        )
