@@ -1,7 +1,7 @@
 """Running options, one environment step at a time: the same in ``learn`` and in ``predict`` (sections 3.2.4, A.6)."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
@@ -138,10 +138,6 @@ class Chosen(NamedTuple):
 class Rules(Protocol):
     """What the paper does in place of the planner."""
 
-    @property
-    def skills(self) -> dict[str, Option]:
-        """The options that have a policy of their own, by their ids."""
-
     def choose(self, state: RunnerState, i: int, point: np.ndarray, goal: np.ndarray, stance: float) -> Chosen:
         """Choose an option as :meth:`Runner.choose` does."""
 
@@ -159,20 +155,25 @@ class Runner:
     :param planner: plans over it
     :param actor: the walker's policy
     :param view: what a policy sees
+    :param skills: the options that have a policy of their own, by their ids
     :param rules: what chooses options in place of the planner, if there is such a thing
     """
 
-    def __init__(self, graph: SkillGraph, planner: Planner, actor: NumpyActor, view: View, rules: Rules | None = None) -> None:
+    def __init__(
+        self,
+        graph: SkillGraph,
+        planner: Planner,
+        actor: NumpyActor,
+        view: View,
+        skills: Mapping[str, Option] | None = None,
+        rules: Rules | None = None,
+    ) -> None:
         self.graph = graph
         self.planner = planner
         self.actor = actor
         self.view = view
+        self.skills = {} if skills is None else skills
         self.rules = rules
-
-    @property
-    def skills(self) -> dict[str, Option]:
-        """The options that have a policy of their own, by their ids."""
-        return {} if self.rules is None else self.rules.skills
 
     # -- one step -----------------------------------------------------------------------------------------------------
 

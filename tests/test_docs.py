@@ -1,4 +1,4 @@
-"""The page that says what the algorithm does names functions that exist."""
+"""The pages that say what the algorithm does name functions that exist."""
 
 import importlib
 import pkgutil
@@ -9,8 +9,9 @@ import pytest
 
 import sb3_skillgraph
 
-PAGE = Path(__file__).parents[1] / "docs" / "algorithm.md"
-NAMED = sorted(set(re.findall(r"\b([A-Z]\w+)\.(_?[a-z]\w*)", PAGE.read_text())))
+DOCS = Path(__file__).parents[1] / "docs"
+PAGES = DOCS / "algorithm.md", DOCS / "paper.md"
+NAMED = sorted({found for page in PAGES for found in re.findall(r"`?\b([A-Z]\w+)\.(_?[a-z]\w*)", page.read_text())})
 
 
 def classes() -> dict[str, type]:

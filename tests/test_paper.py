@@ -511,5 +511,5 @@ def test_it_is_drawn_and_compared(learned: SkillGraphAgent, tmp_path: Path) -> N
     assert arguments["batch_size"] == 32
     with pytest.raises(ValueError, match="unknown rules 'papers'"):
         check_hyperparams({"rules": "papers"}, "here")
-    train(TOY, {}, {**arguments, "policy_kwargs": {"net_arch": [8]}}, 60, 0, tmp_path)
+    train(TOY, {}, {**arguments, "policy": "MultiInputPolicy", "policy_kwargs": {"net_arch": [8]}}, 60, 0, tmp_path)
     assert json.loads((tmp_path / "config.json").read_text())["arguments"]["rules"]["timeout"] == 200

@@ -74,6 +74,7 @@ class OptionReplay(ReplayBuffer):
     :param hindsight: share of own transitions that take an achieved goal
     :param shared: share of a batch that comes from the whole store
     :param horizon: steps ahead from which an achieved goal is drawn
+    :param aim: returns the point that its policy is to aim at, shape ``(goal_dim,)``; None for the goal that was pursued
     :param doomed_steps: steps before the agent got stuck in which no goal is put in
     :param capacity: number of own row numbers kept
     :param device: torch device of the samples
@@ -92,6 +93,7 @@ class OptionReplay(ReplayBuffer):
         hindsight: float = 0.8,
         shared: float = 0.5,
         horizon: int = 200,
+        aim: Callable[[], np.ndarray] | None = None,
         doomed_steps: int = 50,
         capacity: int = 100_000,
         device: th.device | str = "auto",
@@ -106,6 +108,7 @@ class OptionReplay(ReplayBuffer):
         self.hindsight = hindsight
         self.shared = shared
         self.horizon = horizon
+        self.aim = aim
         self.doomed_steps = doomed_steps
         self.buffer_size = capacity
         self._rows = np.zeros(256, dtype=np.int64)
@@ -156,6 +159,8 @@ class OptionReplay(ReplayBuffer):
             imagined[:n_own] = rng.random(n_own) < self.hindsight
         data = store.read(rows)
         goal, next_achieved_goal = data["goal"], data["next_achieved_goal"]
+        if self.aim is not None:
+            goal[:] = self.aim()
         # What was achieved on the way to getting stuck would make that way look safe: it all came before.
         doomed = store.doomed(rows, self.doomed_steps)
         imagined[:n_own] &= ~doomed[:n_own]

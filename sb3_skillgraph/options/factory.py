@@ -92,7 +92,10 @@ class OptionFactory:
             device=self.device,
             **self.replay_kwargs,
         )
-        return Option(id, target, termination, self._learner(replay), self.radius)
+        option = Option(id, target, termination, self._learner(replay), self.radius)
+        if termination is not None:
+            replay.aim = lambda: option.subgoal
+        return option
 
     def _learner(self, replay: OptionReplay) -> OffPolicyAlgorithm:
         """Build the SB3 model without an environment, a logger's folder, or a reseeding of the global generators."""

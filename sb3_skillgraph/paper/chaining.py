@@ -154,4 +154,4 @@ class DeepSkillChaining:
         :param options: the restored options
         """
         self.chains = [SkillChain(**spec) for spec in state["chains"]]
-        self.options = {option.id: option for option in options}
+        self.options.update((option.id, option) for option in options)

@@ -47,7 +47,7 @@ class PaperParts(Parts):
         policy = PaperPolicy(graph, chaining, rules.timeout)
         model = WalkModel()
         planner = Planner(graph, model, horizon(agent.env))  # never asked: the rules choose
-        runner = Runner(graph, planner, walker.actor, view, policy)
+        runner = Runner(graph, planner, walker.actor, view, chaining.options, policy)
         salience = find_salience(arguments, graph, store, agent)
         missions: Any = PaperMissions(graph, chaining, salience, rules, arguments["exploration_steps"], rng)
         witness: Any = PaperWitness(graph, chaining, agent.n_envs)

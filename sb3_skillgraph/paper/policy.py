@@ -43,11 +43,6 @@ class PaperPolicy:
         self.chaining = chaining
         self.timeout = timeout
 
-    @property
-    def skills(self) -> dict[str, Option]:
-        """The options that have a network of their own, gestating ones too."""
-        return self.chaining.options
-
     def choose(self, state: RunnerState, i: int, point: np.ndarray, goal: np.ndarray, stance: float) -> Chosen:
         """Choose the option that runs next.
 
@@ -58,7 +53,7 @@ class PaperPolicy:
         :param stance: not used
         """
         way = self.way(state, i, point, goal)
-        option = self.outside(point, goal) if way is None else self.skills[way.vertices[0]]
+        option = self.outside(point, goal) if way is None else self.chaining.options[way.vertices[0]]
         event = self.graph.id(self.graph.locate(point))
         if option is None:
             return Chosen(DIRECT, event, goal, self.timeout)
@@ -91,7 +86,7 @@ class PaperPolicy:
 
     def _runs(self, vertex: str) -> float:
         """Return how often an option at the end of a path is to be run; no edge says so."""
-        return 1.0 / max(self.skills[vertex].success_rate, 1e-3) if vertex in self.skills else 0.0
+        return 1.0 / max(self.chaining.options[vertex].success_rate, 1e-3) if vertex in self.chaining.options else 0.0
 
     def _targets(self, goal: np.ndarray) -> list[str]:
         """Return the vertices at which a goal is reached, or from which a chain that has begun inside goes on to it."""
@@ -109,7 +104,7 @@ class PaperPolicy:
             option = self.chaining.admissible(chain, point)
             if option is not None:
                 return option
-        options = [option for option in self.skills.values() if not option.terminates(point)]
+        options = [option for option in self.chaining.options.values() if not option.terminates(point)]
         able = [option for option in options if not option.mature or option.initiation.optimistic(point[None])[0]]
         return min(able or options, key=lambda option: math.dist(option.subgoal, goal), default=None)
 
@@ -132,7 +127,7 @@ class PaperPolicy:
 
     def _worth(self, vertices: list[str]) -> tuple[float, float]:
         """Return the environment steps until every option on a way has succeeded, and how likely each does at once."""
-        options = [self.skills[vertex] for vertex in vertices if vertex in self.skills]
+        options = [self.chaining.options[vertex] for vertex in vertices if vertex in self.chaining.options]
         steps = sum(option.n_steps / max(option.n_successes, 1) for option in options)
         return steps, math.prod(option.success_rate for option in options)
 
