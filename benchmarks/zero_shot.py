@@ -24,6 +24,7 @@ from scipy import stats
 
 from sb3_skillgraph import SkillGraphAgent, __version__, evaluate_pairs
 from sb3_skillgraph.baselines import StraightOn
+from sb3_skillgraph.envs import find
 from sb3_skillgraph.evaluation import PairsResult, brier_score, calibration
 from sb3_skillgraph.hyperparams import check_hyperparams, load_hyperparams
 
@@ -36,6 +37,7 @@ def run_seed(args: argparse.Namespace, seed: int) -> dict[str, Any]:
     :return: what goes into the file
     """
     th.set_num_threads(1)
+    find(args.env)
     env = gym.make(args.env, **args.env_kwargs)
     settings = {**load_hyperparams(args.env), **check_hyperparams(args.arguments, "--arguments")}
     del settings["n_timesteps"]

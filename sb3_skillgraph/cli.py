@@ -16,7 +16,7 @@ from rich.table import Table
 
 from sb3_skillgraph.agent import SkillGraphAgent
 from sb3_skillgraph.baselines import RandomWalk, StraightOn
-from sb3_skillgraph.envs import find
+from sb3_skillgraph.envs import find, geometry_of
 from sb3_skillgraph.evaluation import NoPairsError, PairsResult, Predictor, evaluate_pairs
 from sb3_skillgraph.experiments.commands import add_compare, add_figure, add_status
 from sb3_skillgraph.experiments.console import UserError, assignment, for_people, positive
@@ -188,8 +188,6 @@ def _evaluate(args: argparse.Namespace) -> int:
     env_kwargs = dict(args.env_kwargs)
     env = _make_env(args.env, env_kwargs)
     try:
-        if not env.has_wrapper_attr("geometry"):
-            raise UserError(f"evaluate draws its pairs from the walls of a maze, and {args.env!r} is none.")
         agent = _load(args.agent, env)
         if args.adapt:
             _load_experience(agent, args.agent.with_name(EXPERIENCE))
@@ -282,7 +280,7 @@ def _load_experience(agent: SkillGraphAgent, path: Path) -> None:
 def _draw(
     agent: SkillGraphAgent, env: gym.Env, out: Path, start: np.ndarray | None = None, goal: np.ndarray | None = None
 ) -> None:
-    geometry = env.get_wrapper_attr("geometry") if env.has_wrapper_attr("geometry") else None
+    geometry = geometry_of(env)
     save_figure(plot_skill_graph(agent, geometry), out / "skill_graph.png")
     trajectory, plan = run_plan(agent, env, start, goal)
     save_figure(plot_plan(agent, geometry, trajectory, plan), out / "plan.png")

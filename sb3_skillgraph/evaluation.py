@@ -1,14 +1,16 @@
 """From anywhere to anywhere: the success rate over random pairs of start and goal (section 4.2)."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
 import gymnasium as gym
 import numpy as np
+from gymnasium import spaces
 
 from sb3_skillgraph.agent import SkillGraphAgent
 from sb3_skillgraph.envs import MazeGeometry
+from sb3_skillgraph.goal_env import success_radius
 from sb3_skillgraph.planning import DIRECT
 
 
@@ -202,27 +204,27 @@ def evaluate_pairs(
     """Measure how often an agent gets from a random start to a random goal.
 
     The agent is the same for every pair: acting changes nothing in it, and adaptation works on a copy. For each pair
-    the environment is reset to its start; the pair succeeds if the agent comes within the success radius at any step of
-    the episode (1000 steps on ``SkillGraph/*`` mazes).
+    the environment is reset to its start; the pair succeeds if the goal is reached at any step of the episode (1000 steps on
+    ``SkillGraph/*`` mazes). Other environments draw start and goal themselves, at each reset; reached is what they call so in
+    ``info["is_success"]`` or ``info["success"]``, else to be within their radius, or the agent's ``event_radius``.
 
     :param agent: anything with SB3's ``predict``
-    :param env: a ``SkillGraph/*`` environment, or the id of one
+    :param env: a goal environment, or the id of one
     :param env_kwargs: keyword arguments for an id, such as ``maze_map`` or ``success_radius``
     :param n_pairs: number of pairs
     :param seed: seed of the pairs, and of the environment
     :param adapt_timesteps: environment steps that a copy of the agent learns with each goal before it is tested
     :return: success rate, interval and every pair
-    :raises NoPairsError: if the environment has no maze geometry to draw pairs from, or one that is too small
+    :raises ValueError: if it is no goal environment, or does not tell when a goal is reached
+    :raises NoPairsError: if it is a maze that is too small
     """
     if n_pairs < 1:
         raise ValueError(f"n_pairs must be 1 at least, not {n_pairs!r}.")
     made = gym.make(env, **(env_kwargs or {})) if isinstance(env, str) else env
     try:
-        if not made.has_wrapper_attr("geometry"):
-            raise NoPairsError(
-                f"Pairs are drawn from the walls of a maze: that needs a SkillGraph/* environment, not {env!r}."
-            )
-        drawn = sample_pairs(made.get_wrapper_attr("geometry"), made.get_wrapper_attr("body_radius"), n_pairs, seed)
+        drawn: Sequence[tuple[np.ndarray | None, np.ndarray | None, float]] = [(None, None, np.nan)] * n_pairs
+        if made.has_wrapper_attr("geometry"):
+            drawn = sample_pairs(made.get_wrapper_attr("geometry"), made.get_wrapper_attr("body_radius"), n_pairs, seed)
         made.reset(seed=seed)
         results = []
         for start, goal, cells in drawn:
@@ -230,6 +232,8 @@ def evaluate_pairs(
             if adapt_timesteps:
                 assert made.spec is not None, "To adapt, give the environment's id."
                 tested = tested.copy(gym.make(made.spec))
+                if goal is None:
+                    raise ValueError("To adapt, the environment must take start and goal at reset, as SkillGraph/* do.")
                 tested.adapt(goal, start=start, total_timesteps=adapt_timesteps)
             results.append(run_pair(tested, made, start, goal, cells))
             if tested is not agent:
@@ -240,37 +244,58 @@ def evaluate_pairs(
             made.close()
 
 
-def run_pair(agent: Predictor, env: gym.Env, start: np.ndarray | None, goal: np.ndarray, cells: float) -> PairResult:
+def run_pair(agent: Predictor, env: gym.Env, start: np.ndarray | None, goal: np.ndarray | None, cells: float) -> PairResult:
     """Let an agent go from a start to a goal; the episode ends there.
 
     :param agent: anything with SB3's ``predict``
-    :param env: a ``SkillGraph/*`` environment
+    :param env: a goal environment; start and goal can be given to ``SkillGraph/*`` ones
     :param start: shape ``(goal_dim,)``; None for where the environment puts the agent
-    :param goal: shape ``(goal_dim,)``
+    :param goal: shape ``(goal_dim,)``; None for what the environment draws
     :param cells: length of the shortest free path, in cells
     :return: what became of it
     """
-    observation, info = env.reset(options={"start": start, "goal": goal})
-    start = observation["achieved_goal"] if start is None else start
+    has_reached = _judge(agent, env)
+    observation, info = env.reset(options=None if goal is None else {"start": start, "goal": goal})
+    start = np.array(observation["achieved_goal"]) if start is None else start
+    goal = np.array(observation["desired_goal"]) if goal is None else goal
     watch = _Watch(agent, observation) if isinstance(agent, SkillGraphAgent) else None
     act = agent.predict if watch is None else watch.predict
     state: tuple[np.ndarray, ...] | None = None
     episode_start = np.ones(1, dtype=bool)
     steps, nearest = 0, _distance(observation)
-    stuck, over = False, bool(info["is_success"])
+    stuck, success = False, has_reached(observation, info)
+    over = success
     while not over:
         action, state = act(observation, state=state, episode_start=episode_start, deterministic=True)
         episode_start = np.zeros(1, dtype=bool)
         observation, _, terminated, truncated, info = env.step(action)
         steps += 1
         nearest = min(nearest, _distance(observation))
-        stuck = bool(info.get("stuck"))
-        over = bool(info["is_success"]) or terminated or truncated or stuck
-    success = bool(info["is_success"])
+        stuck, success = bool(info.get("stuck")), has_reached(observation, info)
+        over = success or terminated or truncated or stuck
     status, trace = None, None
     if watch is not None:
         status, trace = watch.plan.status, watch.ended(success and steps > 0)
     return PairResult(start, goal, cells, success, steps, status, trace, nearest, stuck)
+
+
+def _judge(agent: Predictor, env: gym.Env) -> Callable[[Any, dict[str, Any]], bool]:
+    """Return what tells from an observation and an info whether the goal is reached."""
+    if not isinstance(env.observation_space, spaces.Dict) or "desired_goal" not in env.observation_space.spaces:
+        raise ValueError(f"Goals are reached in goal environments (Dict observations), and {env} is none.")
+    radius = success_radius(lambda name: env.get_wrapper_attr(name) if env.has_wrapper_attr(name) else None)
+    if radius is None:
+        radius = getattr(agent, "event_radius", None)
+
+    def has_reached(observation: Any, info: dict[str, Any]) -> bool:
+        for name in ("is_success", "success"):
+            if name in info:
+                return bool(info[name])
+        if radius is None:
+            raise ValueError(f"{env} does not tell when a goal is reached: it has no radius, and says nothing in its info.")
+        return _distance(observation) <= radius
+
+    return has_reached
 
 
 def _distance(observation: Any) -> float:

@@ -13,6 +13,10 @@ FLOAT32_MAX = float(np.finfo(np.float32).max)
 KEYS = ("observation", "achieved_goal", "desired_goal")
 
 
+#: Metres within which the goals of gymnasium-robotics' ``PointMaze_*`` and ``AntMaze_*`` count as reached.
+ROBOTICS_MAZE_RADIUS = 0.45
+
+
 class GoalSpec(NamedTuple):
     """Lengths of the flat observation, the goal and the action of a goal environment."""
 
@@ -153,6 +157,19 @@ def check_finite(observation: dict[str, np.ndarray], step: int) -> None:
 def env_attribute(env: VecEnv, name: str) -> Any:
     """Return an attribute of the first environment, whatever wrappers lie around it; None if it has none."""
     return env.get_attr(name, indices=0)[0] if env.has_attr(name) else None
+
+
+def success_radius(get: Callable[[str], Any]) -> Any:
+    """Return within which distance an environment counts a goal as reached, by the names in use; None if it does not tell.
+
+    :param get: returns an attribute of the environment, None if it has none
+    """
+    for name in ("success_radius", "distance_threshold"):
+        radius = get(name)
+        if radius is not None:
+            return radius
+    # gymnasium-robotics' mazes have a number in their code, and no name for it.
+    return ROBOTICS_MAZE_RADIUS if hasattr(get("maze"), "maze_size_scaling") else None
 
 
 def find_view(view: str | View | None, env: VecEnv | None, spec: GoalSpec) -> tuple[str | None, View]:

@@ -9,7 +9,7 @@ from stable_baselines3 import DDPG, SAC, TD3
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_skillgraph.goal_env import GoalSpec, Oracle, env_attribute, find_view
+from sb3_skillgraph.goal_env import GoalSpec, Oracle, env_attribute, find_view, success_radius
 from sb3_skillgraph.graph import SkillGraph
 from sb3_skillgraph.learning.dco import DCOSalience
 from sb3_skillgraph.learning.missions import Missions
@@ -256,9 +256,8 @@ def _box(space: spaces.Space) -> spaces.Box:
 
 def _event_radius(given: float | None, env: VecEnv | None) -> float:
     radius: Any = given
-    for name in ("success_radius", "distance_threshold"):
-        if radius is None and env is not None:
-            radius = env_attribute(env, name)
+    if radius is None and env is not None:
+        radius = success_radius(lambda name: env_attribute(env, name))
     if radius is None:
         raise ValueError(
             "event_radius is required: the environment has neither a success_radius nor a distance_threshold to take "

@@ -192,7 +192,6 @@ def test_training_takes_steps_from_yaml_and_names_the_folder(tmp_path: Path, mon
         (["train", "SkillGraph/PointMaze-v0"], "maze_map is required"),
         (["evaluate", "nothing.zip", "--env", TOY], "no file"),
         (["plot", "nothing.zip", "--env", TOY, "--out", "x"], "no file"),
-        (["evaluate", "nothing.zip", "--env", "CartPole-v1"], "maze"),
         (["evaluate", "nothing.zip"], "--env"),
         (["dance"], "dance"),
     ],

@@ -12,7 +12,7 @@ from conftest import POINT, TOY, Recorder, check_store, differences, new_agent, 
 import sb3_skillgraph
 from sb3_skillgraph import SkillGraphAgent
 from sb3_skillgraph.baselines import StraightOn
-from sb3_skillgraph.envs import U_MAZE, MazeGeometry, MazeMap
+from sb3_skillgraph.envs import U_MAZE, MazeGeometry, MazeMap, find, geometry_of
 from sb3_skillgraph.evaluation import PairResult, PairsResult, SkillTrace, brier_score, evaluate_pairs, run_pair
 from sb3_skillgraph.planning import DIRECT, GOAL
 
@@ -207,8 +207,52 @@ def test_an_agent_that_is_stuck_is_given_up() -> None:
     assert [(pair.stuck, pair.success, pair.steps) for pair in result.pairs] == [(True, False, 3)] * 3
 
 
+class Bare(gym.Env):
+    """The toy maze as a stranger might write it: no walls to draw from, no radius, nothing in its info."""
+
+    def __init__(self) -> None:
+        self.inner = gym.make(TOY, max_steps=40)
+        self.observation_space, self.action_space = self.inner.observation_space, self.inner.action_space
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        assert options is None
+        return self.inner.reset(seed=seed)[0], {}
+
+    def step(self, action: Any) -> Any:
+        return (*self.inner.step(action)[:-1], {})
+
+
+def test_environments_without_walls_draw_starts_and_goals_themselves(trained: SkillGraphAgent) -> None:
+    result = evaluate_pairs(trained, Bare(), n_pairs=8)
+    assert len({tuple(pair.goal) for pair in result.pairs}) == 8
+    for pair in result.pairs:
+        assert pair.success == (pair.nearest <= trained.event_radius)
+        assert np.isnan(pair.path_length)
+    assert any(pair.success for pair in result.pairs)
+    with pytest.raises(ValueError, match="does not tell when a goal is reached"):
+        evaluate_pairs(RandomWalk(), Bare(), n_pairs=1)
+    with pytest.raises(ValueError, match="To adapt, the environment must take"):
+        gym.register("Bare-v0", Bare)
+        evaluate_pairs(trained, "Bare-v0", n_pairs=1, adapt_timesteps=10)
+
+
+@pytest.mark.mujoco
+def test_mazes_of_gymnasium_robotics_as_they_come() -> None:
+    find("PointMaze_UMaze-v3")
+    env = gym.make("PointMaze_UMaze-v3")
+    agent = new_agent(env)
+    assert agent.event_radius == 0.45
+    assert agent.parts.planner.horizon == 300
+    geometry = geometry_of(env)
+    assert geometry is not None
+    result = evaluate_pairs(agent, "PointMaze_UMaze-v3", n_pairs=3)
+    for pair in result.pairs:
+        assert geometry.is_free([pair.start, pair.goal]).all()
+    assert geometry_of(gym.make("CartPole-v1")) is None
+
+
 def test_bad_arguments() -> None:
-    with pytest.raises(ValueError, match="needs a SkillGraph/\\* environment, not 'Pendulum-v1'"):
+    with pytest.raises(ValueError, match=r"goal environments .*Pendulum.* is none"):
         evaluate_pairs(RandomWalk(), "Pendulum-v1")
     with pytest.raises(ValueError, match="too small"):
         evaluate_pairs(RandomWalk(), TOY, n_pairs=1, env_kwargs=dict(maze_map=[[1, 1, 1], [1, "r", 1], [1, 1, 1]]))

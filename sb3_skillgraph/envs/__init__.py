@@ -22,6 +22,7 @@ __all__ = [
     "TellStuck",
     "ToyMazeEnv",
     "find",
+    "geometry_of",
     "on_its_back",
     "register",
 ]
@@ -75,6 +76,18 @@ def find(env_id: str) -> None:
 
         gym.register_envs(gymnasium_robotics)
     gym.spec(name)
+
+
+def geometry_of(env: gym.Env) -> MazeGeometry | None:
+    """Return the walls of a maze of ours or of gymnasium-robotics; None for any other environment.
+
+    :param env: the environment
+    """
+    if env.has_wrapper_attr("geometry"):
+        geometry: MazeGeometry = env.get_wrapper_attr("geometry")
+        return geometry
+    maze: Any = getattr(env.unwrapped, "maze", None)
+    return MazeGeometry(maze.maze_map, maze.maze_size_scaling) if hasattr(maze, "maze_size_scaling") else None
 
 
 register()
