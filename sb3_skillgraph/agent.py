@@ -26,7 +26,7 @@ from sb3_skillgraph.learning.salience import Salience
 from sb3_skillgraph.options.learner import OptionDDPG
 from sb3_skillgraph.options.option import Option
 from sb3_skillgraph.options.views import View
-from sb3_skillgraph.options.walk import Walk
+from sb3_skillgraph.options.walk import Walks
 from sb3_skillgraph.parts import Parts
 from sb3_skillgraph.plan import Plan
 from sb3_skillgraph.rules import PaperRules
@@ -156,6 +156,8 @@ class SkillGraphAgent(OffPolicyAlgorithm):
             sde_support=False,
             support_multi_env=True,
         )
+        if rules is not None and not isinstance(rules, PaperRules):
+            raise ValueError(f"rules must be PaperRules() or None, not {rules!r}: SkillGraphAgent(..., **PAPER).")
         self.rules = rules
         self._interrupts = Interrupts()
         self._env_snapshot: dict[str, Any] | None = None
@@ -206,7 +208,7 @@ class SkillGraphAgent(OffPolicyAlgorithm):
         return list(self.graph.events)
 
     @property
-    def options(self) -> list[Walk] | list[Option]:
+    def options(self) -> Walks | list[Option]:
         """All options: the walks, one to each event, which share their SB3 model, ``option.learner``.
 
         With ``**PAPER`` they are skills, each with a model of its own.
@@ -280,7 +282,8 @@ class SkillGraphAgent(OffPolicyAlgorithm):
         """Let the running options act, with noise; nothing is kept until the step is stored."""
         assert isinstance(self._last_obs, dict)
         observation = {key: rows(self._last_obs, key) for key in ("observation", "achieved_goal")}
-        scaled = self.parts.rollout.act(observation, self.num_timesteps < self.learning_starts, action_noise)
+        with self._interrupts:
+            scaled = self.parts.rollout.act(observation, self.num_timesteps < self.learning_starts, action_noise)
         return self.parts.unscale(scaled), scaled
 
     def _store_transition(
@@ -319,9 +322,9 @@ class SkillGraphAgent(OffPolicyAlgorithm):
             return  # loaded without its replay buffer: first gather some experience
         if self.gradient_steps > 0:
             gradient_steps *= self.n_envs  # as many for a step, however many environments take it at once
-        for option in self.parts.learners():
-            if option.replay.size() >= batch_size:
-                self._train(option.learner, gradient_steps, batch_size)
+        for option, n_updates in self.parts.learners(gradient_steps):
+            if n_updates > 0 and option.replay.size() >= batch_size:
+                self._train(option.learner, n_updates, batch_size)
         self._n_updates += gradient_steps
         self.graph.now = float(self._n_updates)  # records age as the walker learns
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
@@ -440,7 +443,8 @@ class SkillGraphAgent(OffPolicyAlgorithm):
         Learn to reach a goal the graph does not reach yet (section 3.3, cases b and c).
 
         For ``total_timesteps`` the agent pursues nothing else. While it has not been there it looks for a way, from the event
-        nearest to the goal and from others; whoever arrives goes elsewhere, to come back.
+        nearest to the goal and from others; whoever arrives goes elsewhere, to come back. With ``**PAPER`` a chain to the goal
+        is learned from the nearest vertex, or one option from where another can start.
 
         :param goal: shape ``(goal_dim,)``
         :param start: where episodes begin meanwhile, for environments whose ``reset`` takes ``options={"start": ...}``

@@ -11,7 +11,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_skillgraph.goal_env import GoalSpec, Oracle, env_attribute, find_view, success_radius
 from sb3_skillgraph.graph import SkillGraph
-from sb3_skillgraph.learning.dco import DCOSalience
+from sb3_skillgraph.learning.dco import LEARN_EVERY, DCOSalience
 from sb3_skillgraph.learning.missions import Missions
 from sb3_skillgraph.learning.rollout import Rollout
 from sb3_skillgraph.learning.salience import FrontierSalience, RandomSalience, Salience
@@ -21,7 +21,7 @@ from sb3_skillgraph.options.factory import OptionFactory
 from sb3_skillgraph.options.learner import OptionDDPG, OptionLearner, OptionTD3
 from sb3_skillgraph.options.option import Option
 from sb3_skillgraph.options.views import ScaledView
-from sb3_skillgraph.options.walk import Walk
+from sb3_skillgraph.options.walk import Walk, Walks
 from sb3_skillgraph.plan import Plan, describe
 from sb3_skillgraph.planning import Planner
 from sb3_skillgraph.runner import Runner, RunnerState
@@ -145,10 +145,11 @@ class Parts:
         rollout = common.rollout(runner, missions, witness, arguments)
         return cls(rng, view_name, factory, store, walker, graph, model, planner, runner, missions, witness, rollout)
 
-    def options(self) -> list[Any]:
+    def options(self) -> Any:
         """Return all options: the walks, one to each event, which share their SB3 model."""
         graph, learner = self.graph, self.walker.learner
-        return [Walk(id, event, learner, self.runner) for id, event in zip(graph.walk_ids, graph.events, strict=True)]
+        walks = (Walk(id, event, learner) for id, event in zip(graph.walk_ids, graph.events, strict=True))
+        return Walks(walks, self.runner)
 
     def plan(self, state: RunnerState, point: np.ndarray, goal: np.ndarray) -> Plan:
         """Tell how the agent goes about a goal.
@@ -159,9 +160,12 @@ class Parts:
         """
         return describe(self.runner, state, point, goal)
 
-    def learners(self) -> list[Option]:
-        """Return the options whose networks learn now."""
-        return [self.walker]
+    def learners(self, n_updates: int) -> list[tuple[Option, int]]:
+        """Return the options whose networks learn now, each with its number of updates.
+
+        :param n_updates: how many there are to be
+        """
+        return [(self.walker, n_updates)]
 
     def get_state(self) -> dict[str, Any]:
         """Return what has been learned beside the walker's networks, as plain data."""
@@ -296,20 +300,23 @@ def _option_kwargs(agent: OffPolicyAlgorithm, arguments: dict[str, Any]) -> dict
     return {**kwargs, **(arguments["option_kwargs"] or {})}
 
 
-def find_salience(arguments: dict[str, Any], graph: SkillGraph, store: TransitionStore, agent: OffPolicyAlgorithm) -> Salience:
+def find_salience(
+    arguments: dict[str, Any], graph: SkillGraph, store: TransitionStore, agent: OffPolicyAlgorithm, relearn: int = LEARN_EVERY
+) -> Salience:
     """Return what proposes salient events.
 
     :param arguments: the agent's keyword arguments
     :param graph: the skill graph
     :param store: the transitions
     :param agent: gives the environment
+    :param relearn: transitions after which DCO learns another embedding
     :raises ValueError: if there is no such thing
     """
     salience = arguments["salience"]
     if salience == "frontier":
         return FrontierSalience(graph)
     if salience == "dco":
-        return DCOSalience(store, graph.walk_steps)
+        return DCOSalience(store, graph.walk_steps, relearn)
     if salience == "rrt":
         return RandomSalience(Oracle(agent.get_env))
     if not hasattr(salience, "propose"):

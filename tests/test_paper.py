@@ -1,7 +1,6 @@
 """``PAPER``: the paper as written, section by section; the names of the tests tell which."""
 
 import json
-import math
 from pathlib import Path
 from typing import Any
 
@@ -188,26 +187,26 @@ def test_a_1_2_when_new_events_are_looked_for() -> None:
     # At once, in pairs; then not before the last one is in the graph or K episodes have passed.
     graph = new_graph((0.0, 0.0))
     missions = new_missions(graph, (3.0, 0.0), (-3.0, 0.0), (0.0, 3.0), (0.0, -3.0), salient_event_freq=30, retry_after=10)
-    missions._choose(np.zeros(2))
+    missions.prepare()
     assert len(graph.events) == 3
     missions.n_episodes = 29
-    missions._choose(np.zeros(2))
+    missions.prepare()
     assert len(graph.events) == 3
     missions.n_episodes = 30
-    missions._choose(np.zeros(2))
+    missions.prepare()
     assert len(graph.events) == 5
     assert missions.newest == "e4"
     # The newest is in the graph: again at once. Both are rejected: not before R episodes have passed.
     new_option(graph, "o9", "e4", ((0.0, 0.0), 0.4), effects=((0.0, -3.0),))
     assert "e4" in graph.joined()
     missions.salience = Points((3.1, 0.0), (-3.1, 0.0), (6.0, 0.0))  # type: ignore[assignment]
-    missions._choose(np.zeros(2))
+    missions.prepare()
     assert (len(graph.events), missions.last_rejected) == (5, 30)
     missions.n_episodes = 39
-    missions._choose(np.zeros(2))
+    missions.prepare()
     assert len(graph.events) == 5
     missions.n_episodes = 40
-    missions._choose(np.zeros(2))
+    missions.prepare()
     assert (len(graph.events), missions.last_rejected) == (6, None)
 
 
@@ -217,11 +216,14 @@ def test_a_1_2_when_new_events_are_looked_for() -> None:
 def test_3_2_2_every_event_is_as_likely_a_target() -> None:
     graph = new_graph((0.0, 0.0), (3.0, 0.0), (0.0, 3.0), (3.0, 3.0))
     missions = new_missions(graph)
-    missions.last_rejected = 0
+    for event in graph.events[1:]:
+        missions.chaining.open_chain(graph.events[0], event)
     targets = [tuple(missions._choose(np.zeros(2)).goal) for _ in range(300)]
     counts = [targets.count(tuple(event.center)) for event in graph.events]
     assert counts[0] == 0, "the agent stands in it"
     assert min(counts[1:]) > 75
+    targets = [tuple(missions._choose(np.array([9.0, 9.0])).goal) for _ in range(50)]
+    assert tuple(graph.events[0].center) not in targets, "no chain leads back to the start yet"
 
 
 def test_3_2_2_a_reached_target_is_followed_by_another() -> None:
@@ -252,12 +254,13 @@ def line() -> tuple[PaperGraph, DeepSkillChaining, PaperPolicy]:
         chaining.options[id] = new_option(
             graph, id, target, ((start, 0.0), 0.6), effects=((end, 0.0),) * 3, n_failures=n_failures
         )
-    return graph, chaining, PaperPolicy(graph, chaining, 200)
+    return graph, chaining, PaperPolicy(graph, chaining, 200, 1_000)
 
 
 def test_3_2_4_the_first_option_of_the_cheapest_path_runs() -> None:
     graph, _, policy = line()
     goal = graph.events[2].center
+    graph.triggered("e2", goal)
     chosen = policy.choose(state(), 0, NEAR, goal, 0.0)
     assert (chosen.option, chosen.event, chosen.timeout) == ("o1", "e0", 200)
     np.testing.assert_array_equal(chosen.aim, graph.events[1].center)
@@ -310,6 +313,27 @@ def test_3_2_5_chains_grow_backwards_until_an_option_starts_at_the_source() -> N
     assert chain.complete
     assert len(chain.options) == 2
     assert graph.joined() == {"e0", "e1"}
+    # What is complete may be so no more: then there is something to learn again.
+    graph.triggered("e0", np.array([0.0, 0.49]))
+    graph.triggered("e0", np.array([0.0, -9.0]))
+    chaining.failed(child, np.array([0.2, 0.0]), 200)
+    assert not chain.complete
+    assert len(chain.options) == 3
+
+
+def test_3_2_5_a_chain_is_complete_where_any_event_of_the_graph_can_start_it() -> None:
+    graph = new_graph((0.0, 0.0), (3.0, 0.0), (6.0, 0.0))
+    new_option(graph, "x0", "e1", ((0.0, 0.0), 0.4), effects=((3.0, 0.0),))
+    chaining = new_chaining(graph)
+    chain = chaining.open_chain(graph.events[0], graph.events[2])
+    root = chaining.options[chain.options[0]]
+    for n in range(3):
+        run_along(chaining, root, [2.7 + 0.1 * n, 3.3, 4.0, 5.0], 6.0)
+    assert graph.nx.has_edge("e1", root.id)
+    assert chain.complete
+    assert len(chain.options) == 1
+    back = chaining.open_chain(graph.events[2], graph.events[0], back=True)
+    assert not back.complete
 
 
 def test_failures_shrink_where_an_option_starts() -> None:
@@ -337,12 +361,12 @@ def test_a_3_the_way_back_is_learned_once_the_way_there_is_complete() -> None:
     missions = new_missions(graph)
     missions.last_rejected = 0
     chain = missions.chaining.open_chain(*graph.events)
-    missions._choose(np.zeros(2))
+    missions.prepare()
     assert len(missions.chaining.chains) == 1
     chain.complete = True
-    missions._choose(np.zeros(2))
-    missions._choose(np.zeros(2))
-    assert [(c.source, c.target) for c in missions.chaining.chains] == [("e0", "e1"), ("e1", "e0")]
+    missions.prepare()
+    missions.prepare()
+    assert [(c.source, c.target, c.back) for c in missions.chaining.chains] == [("e0", "e1", False), ("e1", "e0", True)]
 
 
 # -- 3.3: goals that were never seen ----------------------------------------------------------------------------------
@@ -364,6 +388,7 @@ def test_3_3_b_a_goal_in_an_initiation_set_gets_an_option_with_that_set() -> Non
     missions = PaperMissions(graph, chaining, Points(), PaperRules(), 20, np.random.default_rng(0))
     missions.cut(1)
     missions.pinned = goal
+    missions.prepare()
     np.testing.assert_array_equal(missions._choose(NEAR).goal, goal)
     event = graph.events[-1]
     root = chaining.options[chaining.leading_to(event.id)[0].options[0]]
@@ -372,8 +397,11 @@ def test_3_3_b_a_goal_in_an_initiation_set_gets_an_option_with_that_set() -> Non
     # The planner leads to where it can start, and there it runs.
     assert policy.choose(state(), 0, NEAR, goal, 0.0).option == "o1"
     assert policy.choose(state(), 0, np.array([3.2, -0.1]), goal, 0.0).option == root.id
-    missions._choose(NEAR)
+    missions.prepare()
     assert len(graph.events) == 5, "once"
+    plan = policy.plan(state(), NEAR, goal)
+    assert (plan.status, plan.success_probability) == ("in_initiation_set", 0.0)
+    assert sorted(graph.nx.edges) == sorted(rebuilt(graph).nx.edges)
 
 
 def test_3_3_c_a_goal_outside_is_approached_by_the_nearest_vertex() -> None:
@@ -381,7 +409,7 @@ def test_3_3_c_a_goal_outside_is_approached_by_the_nearest_vertex() -> None:
     goal = np.array([6.0, 4.0])
     plan = policy.plan(state(), NEAR, goal)
     assert (plan.status, plan.path[0], plan.path[-1]) == ("outside", "o1", "e2")
-    assert (plan.success_probability, plan.expected_steps) == (0.0, math.inf)
+    assert (plan.success_probability, plan.expected_steps) == (0.0, 1_000.0)
     assert "go near it" in str(plan)
     there = np.array([6.0, 0.0])
     assert policy.plan(state(), there, goal).path == ()
@@ -398,8 +426,40 @@ def test_a_6_outside_the_graph_the_policy_over_options_decides() -> None:
     assert policy.plan(state(), far, graph.events[2].center).path == ()
     chain = chaining.open_chain(graph.events[0], graph.events[2])
     assert policy.choose(state(), 0, far, graph.events[2].center, 0.0).option == chain.options[0]
-    empty = PaperPolicy(new_graph(), new_chaining(new_graph()), 200)
+    empty = PaperPolicy(new_graph(), new_chaining(new_graph()), 200, 1_000)
     assert empty.choose(state(), 0, far, NEAR, 0.0).option == DIRECT, "before there is any option"
+
+
+def rebuilt(graph: PaperGraph) -> PaperGraph:
+    """The graph as it is made from what is saved."""
+    other = PaperGraph(2, RADIUS)
+    other.set_state(graph.get_state())
+    other.set_options(graph.options, graph.options)
+    return other
+
+
+def test_events_may_overlap() -> None:
+    graph = new_graph((0.0, 0.0), (2.4, 0.0), (3.0, 0.0))
+    chaining = new_chaining(graph)
+    chaining.options["o0"] = new_option(graph, "o0", "e1", ((0.0, 0.0), 0.6), effects=((2.4, 0.0),))
+    chaining.options["o1"] = new_option(graph, "o1", "e2", ((2.4, 0.0), 0.4), effects=((3.0, 0.0),))
+    policy = PaperPolicy(graph, chaining, 200, 1_000)
+    there, goal = np.array([2.55, 0.0]), np.array([9.0, 0.0])
+    assert [event.id for event in graph.events_at(there)] == ["e1", "e2"]
+    assert policy.choose(state(), 0, there, goal, 0.0).event == "e2", "of the events that hold it the one nearest to the goal"
+    assert policy.plan(state(), there, goal).path == (), "it is at the nearest vertex"
+
+
+def test_what_a_way_is_worth() -> None:
+    _, chaining, policy = line()
+    option = chaining.options["o1"]
+    assert policy.worth(["o1", "e1"], 1_000.0) == (10.0, pytest.approx(1.0))
+    option.n_runs, option.n_steps = 6, 60  # every other run succeeds, each takes 10 steps
+    steps, probability = policy.worth(["o1"], 20.0)
+    assert steps == 20.0
+    assert probability == pytest.approx(0.75)
+    option.n_successes = 0
+    assert policy.worth(["o1"], 1_000.0) == (1_000.0, 0.0)
 
 
 # -- the agent --------------------------------------------------------------------------------------------------------
@@ -486,6 +546,41 @@ def test_it_learns_in_several_environments_and_adapts() -> None:
     goal = np.array([1.0, -1.0])
     agent.adapt(goal, total_timesteps=300)
     assert any(np.array_equal(event.center, goal) for event in agent.events)
+
+
+def test_options_learn_as_often_as_they_run() -> None:
+    for train_freq, n_envs in (((1, "episode"), 1), (5, 1), (1, 4)):
+        env: Any = new_vec_env(n_envs=n_envs) if n_envs > 1 else TOY
+        agent = small(env=env, train_freq=train_freq, gradient_steps=-1 if train_freq == (1, "episode") else 1)
+        agent.learn(1_600, log_interval=None)
+        updates = {option.id: option.learner._n_updates for option in agent.options}
+        rows = {option.id: len(option.replay._readable()) for option in agent.options}  # type: ignore[union-attr]
+        per_step = 1.0 if train_freq != 5 else 0.2
+        assert sum(rows.values()) > 500
+        for id, n in updates.items():
+            assert n <= per_step * rows[id] + 20
+            assert n >= per_step * (rows[id] - 64) - 60
+    assert not agent.parts.rollout.ran
+
+
+def test_counters_outlive_a_fresh_start(tmp_path: Path) -> None:
+    agent = small().learn(900, log_interval=None)
+    agent.save(tmp_path / "agent")
+    loaded = SkillGraphAgent.load(tmp_path / "agent", env=gym.make(TOY), force_reset=True)
+    for name in ("n_episodes", "last_accepted", "last_rejected", "newest"):
+        assert getattr(loaded.parts.missions, name) == getattr(agent.parts.missions, name)
+    assert agent.parts.missions.n_episodes > 0
+
+
+def test_rows_that_are_none_are_refused(tmp_path: Path) -> None:
+    agent = small().learn(500, log_interval=None)
+    experience = agent.parts.get_experience()
+    id = next(id for id, rows in experience["rows"].items() if len(rows) > 1)
+    for rows in ([5, 4], [-1, 3], [0, 10**6], [[1, 2]]):
+        with pytest.raises(ValueError, match=f"rows of option {id}"):
+            agent.parts.set_experience({**experience, "rows": {**experience["rows"], id: np.array(rows)}})
+    with pytest.raises(ValueError, match="rules must be PaperRules"):
+        new_agent(rules="paper")
 
 
 def test_dsg_dco() -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch as th
 from builders import make_factory, make_option
-from conftest import TOY
+from conftest import TOY, new_agent
 from gymnasium import spaces
 from sb3_contrib import MaskablePPO
 from stable_baselines3.common.buffers import ReplayBuffer
@@ -279,7 +279,7 @@ def test_walks_keep_their_actions_when_events_are_merged(trained: SkillGraphAgen
     env = OptionsEnv(gym.make(TOY), trained.options)
     before = [env.index(option.id) for option in trained.options]
     assert before == list(range(len(before)))
-    assert env.max_options == trained.graph.max_events + 6  # the walk straight to the goal, and five primitives
+    assert env.max_options == 2 * trained.graph.max_events + 6  # the walk straight to the goal, and five primitives
     kept = {option.id: env.index(option.id) for option in trained.options}
     trained.graph.coarsen()
     new = trained.graph.add_event(np.array([5.0, 5.0]), salient=True)
@@ -319,11 +319,47 @@ def test_a_stuck_walk_ends_the_episode(trained: SkillGraphAgent) -> None:
 
 
 def test_walks_and_other_options_do_not_mix(trained: SkillGraphAgent, options: list[Option], walker: Option) -> None:
-    for arguments in (([*trained.options, options[0]], None), (trained.options, walker)):
-        with pytest.raises(ValueError, match="go with no others"):
+    for arguments in (([*trained.options, options[0]], None), (trained.options, walker), (trained.options[:2], None)):
+        with pytest.raises(ValueError, match="go with no other options"):
             OptionsEnv(gym.make(TOY), arguments[0], global_option=arguments[1])  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="not this agent's"):
+    with pytest.raises(ValueError, match="not this agent's walks"):
         GraphPolicy(trained, lifted(options, walker))
+
+
+def test_a_new_agents_walks_come_with_time() -> None:
+    agent = new_agent()
+    env = OptionsEnv(gym.make(TOY), agent.options)
+    env.reset(seed=0)
+    assert env.action_masks().sum() == 6
+    agent.learn(400, log_interval=None)
+    env.reset(seed=0)
+    assert env.index(agent.options[-1].id) == len(agent.events) - 1
+
+
+def test_one_step_of_the_walk_is_one_step_and_leaves_no_record(trained: SkillGraphAgent) -> None:
+    env = OptionsEnv(gym.make(TOY), trained.options)
+    env.primitives[-1] = None  # as where actions have many dimensions
+    env.reset(options={"start": [-1.0, 1.0], "goal": [1.0, -1.0]})
+    for n in range(1, 4):
+        assert env.step(env.max_options - 1)[-1]["tau"] == 1
+        assert (env.actions.state.option[0], env.actions.state.elapsed[0]) == ("", n)
+    assert not env.actions.state.run_option.any()
+
+
+def test_graph_policy_is_evaluated_as_any_policy(trained: SkillGraphAgent) -> None:
+    env = Monitor(OptionsEnv(gym.make(TOY, terminate_on_success=True, max_steps=200), trained.options))
+    policy: Any = GraphPolicy(trained, env.env)  # type: ignore[arg-type]
+    assert evaluate_policy(policy, env, n_eval_episodes=3)[0] > 0.0
+
+
+def test_a_flat_policy_over_walks_keeps_all_in_its_state(trained: SkillGraphAgent) -> None:
+    env = OptionsEnv(gym.make(TOY), trained.options)
+    flat, toy = FlatPolicy(Turns(), env), gym.make(TOY)
+    episodes = [toy.reset(options={"start": start, "goal": [1.0, -1.0]})[0] for start in ([-1.0, 1.0], [1.0, 1.0])]
+    first = flat.predict(episodes[0])[1]
+    alone = flat.predict(episodes[0], first)[0]
+    flat.predict(episodes[1])  # another episode in between
+    np.testing.assert_array_equal(flat.predict(episodes[0], first)[0], alone)
 
 
 class Turns:

@@ -123,17 +123,19 @@ def learn_fiedler(store: TransitionStore, reach: int, n_pairs: int, rng: np.rand
 class DCOSalience:
     """The two visited states that are farthest apart in the graph of the agent's transitions (section 3.2.1, *DCO*).
 
-    Every ``LEARN_EVERY`` transitions a :class:`FiedlerEmbedding` is learned from scratch; where it is largest and where it is
+    From time to time a :class:`FiedlerEmbedding` is learned from scratch; where it is largest and where it is
     smallest are proposed in turn.
 
     :param store: the agent's transitions
     :param reach: environment steps that a pair lies at most apart
+    :param relearn: transitions after which another embedding is learned
     :param n_pairs: pairs that an embedding is learned from
     """
 
-    def __init__(self, store: TransitionStore, reach: int, n_pairs: int = 20_000) -> None:
+    def __init__(self, store: TransitionStore, reach: int, relearn: int = LEARN_EVERY, n_pairs: int = 20_000) -> None:
         self.store = store
         self.reach = reach
+        self.relearn = relearn
         self.n_pairs = n_pairs
         self._ends: list[np.ndarray] = []
         self._turn = 0
@@ -143,7 +145,8 @@ class DCOSalience:
         """Propose one end of the explored space, then the other; None before there is any experience."""
         if not len(self.store):
             return None
-        if not self._ends or self.store.total >= self._learned_from + LEARN_EVERY:
+        since = self.store.total - self._learned_from  # negative where the replay buffer was not loaded
+        if not self._ends or not 0 <= since < self.relearn:
             self._learned_from = self.store.total
             embedding = learn_fiedler(self.store, self.reach, self.n_pairs, rng)
             rows = rng.integers(self.store.oldest, self.store.total, self.n_pairs)

@@ -58,6 +58,8 @@ class Rollout:
         self.rng = rng
         self.pending: Step | None = None
         self.n_stuck = 0  # episodes given up
+        self.ran: dict[str, int] = {}  # environment steps of each skill since there was training
+        self.n_steps = 0  # and of all together
         self._forget()
 
     def begin_anew(self, points: np.ndarray) -> None:
@@ -178,6 +180,8 @@ class Rollout:
         for i, option in enumerate(step.state.option.tolist() if skills else ()):
             if option in skills:
                 skills[option].replay.add_rows(rows[i : i + 1])
+                self.ran[option] = self.ran.get(option, 0) + 1
+        self.n_steps += len(points)
         for i in np.flatnonzero(step.state.steps == 1).tolist():
             self.witness.began(i, step.observation["achieved_goal"][i])
         self.state, runs = self.runner.advance(step.state, points, stuck)
@@ -210,6 +214,7 @@ class Rollout:
     def get_state(self) -> dict[str, Any]:
         """Return what the environments are in the middle of, as plain data."""
         state = {"runner": tuple(self.state), "held": self.held, "hold_left": self.hold_left, "n_stuck": self.n_stuck}
+        state |= {"ran": self.ran, "n_steps": self.n_steps}
         return {**state, "missions": self.missions.get_state(), "witness": self.witness.get_state()}
 
     def set_state(self, state: dict[str, Any], same_envs: bool) -> None:
@@ -218,11 +223,11 @@ class Rollout:
         :param state: the state
         :param same_envs: whether the environments go on where they were; else they begin anew
         """
-        self.n_stuck = state["n_stuck"]
+        self.n_stuck, self.ran, self.n_steps = state["n_stuck"], dict(state["ran"]), state["n_steps"]
         self.witness.set_state(state["witness"])
+        self.missions.set_state(state["missions"])
         if not same_envs:
             self._forget()
             return
         self.state = RunnerState(*state["runner"])
         self.held, self.hold_left = state["held"], state["hold_left"]
-        self.missions.set_state(state["missions"])

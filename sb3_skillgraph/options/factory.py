@@ -89,6 +89,7 @@ class OptionFactory:
             self.action_space,
             self.rng,
             everything=everything,
+            capacity=self.store.capacity,
             device=self.device,
             **self.replay_kwargs,
         )

@@ -81,6 +81,14 @@ class Option:
         """Tell whether an option that leads here has succeeded at a point, shape ``(goal_dim,)``."""
         return bool(self.initiation.pessimistic(point[None])[0])
 
+    def can_start(self, point: np.ndarray) -> bool:
+        """Tell whether it may be run from a point, shape ``(goal_dim,)``.
+
+        It must lie in its (optimistic) initiation set, and not where it ends; while an option gestates it may start anywhere:
+        that is how it finds out where it should.
+        """
+        return (not self.mature or bool(self.initiation.optimistic(point[None])[0])) and not self.terminates(point)
+
     def terminates(self, point: np.ndarray) -> bool:
         """Tell whether the option has succeeded at a point, shape ``(goal_dim,)``."""
         assert self.termination is not None, "The global option ends where it is told to."

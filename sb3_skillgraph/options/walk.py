@@ -1,5 +1,6 @@
 """Walks: the options that share one goal-conditioned policy, the walker."""
 
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -17,15 +18,13 @@ class Walk:
     :param target: id of the event it leads to
     :param termination: the event it leads to, where it ends
     :param learner: the SB3 model of the walker, which all walks share
-    :param runner: the agent's :class:`~sb3_skillgraph.runner.Runner`, which runs it
     """
 
-    def __init__(self, id: str, termination: Event, learner: OffPolicyAlgorithm, runner: Any) -> None:
+    def __init__(self, id: str, termination: Event, learner: OffPolicyAlgorithm) -> None:
         self.id = id
         self.target = termination.id
         self.termination = termination
         self.learner = learner
-        self.runner = runner
 
     def __repr__(self) -> str:
         return f"<walk {self.id} to {self.target}>"
@@ -42,3 +41,15 @@ class Walk:
         :return: bool array of shape ``(n,)``
         """
         return self.termination.contains(points)
+
+
+class Walks(list[Walk]):
+    """An agent's walks, in the order of their events, and what runs them.
+
+    :param walks: the walks
+    :param runner: the agent's :class:`~sb3_skillgraph.runner.Runner`
+    """
+
+    def __init__(self, walks: Iterable[Walk], runner: Any) -> None:
+        super().__init__(walks)
+        self.runner = runner

@@ -19,13 +19,16 @@ class SkillChain:
 
     :param source: id of the event where it must be possible to start
     :param target: id of the event it leads to
+    :param back: whether it is the way back from an event that another chain has joined to the graph (section 3.2.7)
     :param options: ids of its options: the first (the root) ends in the target event, each next one in the initiation set
         of the one before
-    :param complete: whether an option of it can be started all over the source event (section A.3)
+    :param complete: whether an option of it can be started all over the source event (section A.3); of a chain that joins an
+        event to the graph, all over any event of the graph
     """
 
     source: str
     target: str
+    back: bool = False
     options: list[str] = field(default_factory=list)
     complete: bool = False
 
@@ -45,18 +48,19 @@ class DeepSkillChaining:
         self.chains: list[SkillChain] = []
         self.options: dict[str, Option] = {}  # gestating ones too
 
-    def open_chain(self, source: Event, target: Event) -> SkillChain:
+    def open_chain(self, source: Event, target: Event, *, back: bool = False) -> SkillChain:
         """Begin the chain between two events, unless there is one.
 
         :param source: where it must be possible to start
         :param target: where it must lead
+        :param back: whether it is a way back
         """
         for chain in self.chains:
             if (chain.source, chain.target) == (source.id, target.id):
                 return chain
-        chain = SkillChain(source.id, target.id)
-        self.chains.append(chain)
+        chain = SkillChain(source.id, target.id, back)
         self._grow(chain, target.id, target)
+        self.chains.append(chain)
         return chain
 
     def _grow(self, chain: SkillChain, target: str, termination: TerminationSet) -> None:
@@ -74,16 +78,10 @@ class DeepSkillChaining:
     def admissible(self, chain: SkillChain, point: np.ndarray) -> Option | None:
         """Return the earliest option of a chain, counted from its target, that can start at a point.
 
-        A gestating option may start anywhere: that is how it finds out where it should.
-
         :param chain: the chain
         :param point: where the agent stands, shape ``(goal_dim,)``
         """
-        for option in (self.options[id] for id in chain.options):
-            startable = not option.mature or bool(option.initiation.optimistic(point[None])[0])
-            if startable and not option.terminates(point):
-                return option
-        return None
+        return next((self.options[id] for id in chain.options if self.options[id].can_start(point)), None)
 
     # -- what runs teach ----------------------------------------------------------------------------------------------
 
@@ -109,7 +107,7 @@ class DeepSkillChaining:
         self._learned(option)
 
     def _learned(self, option: Option) -> None:
-        """Fit where the option can start, let it mature, and see what its chain still needs."""
+        """Fit where the option can start, let it mature, and see what the chains still need."""
         refitted = option.initiation.refit(force=not option.mature)
         if not option.mature:
             if option.n_successes < self.gestation_period:
@@ -117,14 +115,14 @@ class DeepSkillChaining:
             option.mature = True
             self.graph.add_option(option)
         self.graph.refresh(option, refitted)
+        joined = self.graph.joined()
         for chain in self.chains:
-            self._check(chain)
+            self._check(chain, joined)
 
-    def _check(self, chain: SkillChain) -> None:
-        """Close a chain when one of its options can start all over the source; grow it when its last option is mature."""
-        if chain.complete:
-            return
-        chain.complete = any(self.graph.nx.has_edge(chain.source, id) for id in chain.options)
+    def _check(self, chain: SkillChain, joined: set[str]) -> None:
+        """Tell whether a chain can be started where it must; if not, it grows by a child once its last option is mature."""
+        sources = {chain.source} if chain.back else {chain.source, *joined} - {chain.target}
+        chain.complete = any(self.graph.nx.has_edge(source, id) for source in sources for id in chain.options)
         last = self.options[chain.options[-1]]
         if last.mature and not chain.complete:
             self._grow(chain, last.id, last)

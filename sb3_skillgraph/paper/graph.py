@@ -7,6 +7,7 @@ from typing import Any
 import networkx
 import numpy as np
 
+from sb3_skillgraph.events import Event
 from sb3_skillgraph.graph import SkillGraph
 from sb3_skillgraph.options.option import Option
 
@@ -32,10 +33,11 @@ class PaperGraph(SkillGraph):
 
     :param goal_dim: dimension of goal space
     :param radius: radius of the events, in goal units
+    :param walk_steps: environment steps that the pairs of states lie apart at most from which DCO learns
     """
 
-    def __init__(self, goal_dim: int, radius: float) -> None:
-        super().__init__(goal_dim, radius, max_events=2**31)
+    def __init__(self, goal_dim: int, radius: float, walk_steps: int = 40) -> None:
+        super().__init__(goal_dim, radius, max_events=2**31, walk_steps=walk_steps)
         self.cover_radius = radius
         self.options: dict[str, Option] = {}
         self.triggers: dict[str, deque[np.ndarray]] = {}
@@ -58,13 +60,14 @@ class PaperGraph(SkillGraph):
         :return: its index
         """
         i = super().add_event(center, salient=True)
-        self._add_vertex(i)
-        self.triggers[self.events[i].id] = deque([self.events[i].center], maxlen=TRIGGERS_LENGTH)
+        event = self.events[i]
+        place = {f"x{k}": float(x) for k, x in enumerate(event.center)}
+        self._digraph.add_node(event.id, kind="event", salient=True, radius=self.radius, **place)
+        self.triggers[event.id] = deque([event.center], maxlen=TRIGGERS_LENGTH)
+        for option in self.options.values():
+            self._event_option_edge(event.id, option)
+            self._option_event_edge(option, event)
         return i
-
-    def _add_vertex(self, i: int) -> None:
-        place = {f"x{k}": float(x) for k, x in enumerate(self.events[i].center)}
-        self._digraph.add_node(self.events[i].id, kind="event", salient=True, radius=self.radius, **place)
 
     def add_option(self, option: Option) -> None:
         """Add a mature option.
@@ -72,6 +75,7 @@ class PaperGraph(SkillGraph):
         :param option: the option; its edges come with :meth:`refresh`
         """
         self.options[option.id] = option
+        self.version += 1
         self._digraph.add_node(option.id, kind="option", target=option.target)
 
     # -- edges --------------------------------------------------------------------------------------------------------
@@ -85,6 +89,7 @@ class PaperGraph(SkillGraph):
         self.triggers[event].append(np.asarray(point, dtype=np.float64))
         for option in self.options.values():
             self._event_option_edge(event, option)
+        self.version += 1
 
     def refresh(self, option: Option, refitted: bool) -> None:
         """Look again at the edges of an option after one of its runs.
@@ -95,8 +100,7 @@ class PaperGraph(SkillGraph):
         for target in [*self._digraph.successors(option.id)]:
             self._digraph.remove_edge(option.id, target)
         for event in self.events:
-            if option.effects and event.contains(np.stack(option.effects)).all():
-                self._option_edge(option, event.id)
+            self._option_event_edge(option, event)
         for other in self.options.values():
             self._option_option_edge(option, other)
             if refitted:
@@ -112,6 +116,10 @@ class PaperGraph(SkillGraph):
         if first is not second and first.effects and second.initiation.optimistic(np.stack(first.effects)).all():
             self._option_edge(first, second.id)
 
+    def _option_event_edge(self, option: Option, event: Event) -> None:
+        if option.effects and event.contains(np.stack(option.effects)).all():
+            self._option_edge(option, event.id)
+
     def _option_edge(self, option: Option, target: str) -> None:
         rate = option.success_rate
         if rate > 0.0:
@@ -126,13 +134,12 @@ class PaperGraph(SkillGraph):
 
     # -- questions ----------------------------------------------------------------------------------------------------
 
-    def startable(self, point: np.ndarray) -> list[Option]:
-        """Return the options of the graph that can start at a point and do not end there at once.
+    def events_at(self, point: np.ndarray) -> list[Event]:
+        """Return the events that hold a point: they may overlap.
 
         :param point: shape ``(goal_dim,)``
         """
-        options = self.options.values()
-        return [o for o in options if o.initiation.optimistic(point[None])[0] and not o.terminates(point)]
+        return [event for event in self.events if event.holds(point)]
 
     def holding(self, point: np.ndarray) -> list[Option]:
         """Return the options of the graph whose initiation set holds a point.
@@ -166,7 +173,9 @@ class PaperGraph(SkillGraph):
 
         :param goal: its centre, shape ``(goal_dim,)``
         """
-        sets: dict[str, Any] = {**self.triggers, **{o.id: o.effects for o in self.options.values() if o.effects}}
+        # The first trigger of an event is its centre, where nobody need have been.
+        sets: dict[str, Any] = {id: points for id, points in self.triggers.items() if len(points) > 1}
+        sets.update((option.id, option.effects) for option in self.options.values() if option.effects)
         return [id for id, points in sets.items() if (np.linalg.norm(np.stack(points) - goal, axis=1) <= self.radius).all()]
 
     def joined(self) -> set[str]:

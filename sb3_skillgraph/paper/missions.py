@@ -60,8 +60,6 @@ class PaperMissions:
         :param point: where the agent stands, shape ``(goal_dim,)``
         :param warm_up: whether to walk at random, whatever there is to do
         """
-        if not self.graph.events:
-            self.graph.add_event(point)  # where it starts: beta_0 of section 3.2.7
         mission = self.current[env]
         if mission is None:
             mission = self._random_walk(point) if warm_up else self._choose(point)
@@ -82,10 +80,22 @@ class PaperMissions:
         mission.explore_steps -= mission.exploring
         near = math.dist(point.tolist(), mission.goal.tolist()) <= self.graph.radius
         over = done or (mission.explore_steps <= 0 if mission.exploring else near)
+        self.n_episodes += done
         if over:
             self.current[env] = None
-        self.n_episodes += done
+            self.prepare()
         return over
+
+    def prepare(self) -> None:
+        """Do what there is to do between missions: look for new events, where it is time to, and open the chains due."""
+        if self.pinned is not None:
+            self._pinned_event(self.pinned)
+            return
+        if self._is_due():
+            self._attempt()
+        for chain in [chain for chain in self.chaining.chains if chain.complete]:
+            # The way there is known: the way back is learned (A.3).
+            self.chaining.open_chain(self._event(chain.target), self._event(chain.source), back=True)
 
     def discovered(self, env: int) -> None:
         """Nothing follows from it."""
@@ -93,16 +103,10 @@ class PaperMissions:
     # -- choosing -----------------------------------------------------------------------------------------------------
 
     def _choose(self, point: np.ndarray) -> Mission:
-        """Pick a target (section 3.2.2); before that look for new ones, where it is time to."""
+        """Pick a target (section 3.2.2); the start is one as soon as a chain leads back there."""
+        events = [event for event in self.graph.events if not event.holds(point) and self.chaining.leading_to(event.id)]
         if self.pinned is not None:
-            target = self._pinned_event(self.pinned)
-            return Mission(target.center.copy()) if not target.holds(point) else self._random_walk(point)
-        if self._is_due():
-            self._attempt()
-        for chain in list(self.chaining.chains):
-            if chain.complete:  # then the way back is learned, A.3
-                self.chaining.open_chain(self._event(chain.target), self._event(chain.source))
-        events = [event for event in self.graph.events if not event.holds(point)]
+            events = [event for event in events if np.array_equal(event.center, self.pinned)]
         if not events:
             return self._random_walk(point)
         return Mission(events[self.rng.integers(len(events))].center.copy())
@@ -114,7 +118,10 @@ class PaperMissions:
         return self.graph.events[self.graph.index(id)]
 
     def _pinned_event(self, goal: np.ndarray) -> Event:
-        """Return the event that few-shot adaptation is for; a new one gets its chain (section 3.3, cases b and c)."""
+        """Return the event that few-shot adaptation is for; a new one gets its chain (section 3.3, cases b and c).
+
+        In case b its root starts where another option can.
+        """
         for event in self.graph.events:
             if np.array_equal(event.center, goal):
                 return event
@@ -169,5 +176,6 @@ class PaperMissions:
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Restore what :meth:`get_state` returned."""
-        vars(self).update(state)
+        for name in ("pinned", "n_episodes", "last_accepted", "last_rejected", "newest"):
+            setattr(self, name, state[name])
         self.current = [None if spec is None else Mission(**spec) for spec in state["current"]]

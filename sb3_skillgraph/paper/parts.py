@@ -25,7 +25,7 @@ from sb3_skillgraph.walk_model import WalkModel
 class PaperParts(Parts):
     """What a :class:`~sb3_skillgraph.SkillGraphAgent` is made of with ``**PAPER``.
 
-    The walker is there, since every SB3 algorithm has a policy, but it neither acts nor learns.
+    The walker is there, since every SB3 algorithm has a policy, but it does not learn, and acts only where there is no option.
     """
 
     chaining: DeepSkillChaining
@@ -42,15 +42,15 @@ class PaperParts(Parts):
         common = Common.build(agent, spec, arguments, {"shared": 0.0})  # options learn from their own experience
         rng, view_name, view, store, factory, walker, radius = common
         rules = arguments["rules"]
-        graph = PaperGraph(spec.goal_dim, radius)
+        graph = PaperGraph(spec.goal_dim, radius, arguments["walk_steps"])
         chaining = DeepSkillChaining(graph, factory.make, rules.gestation_period)
-        policy = PaperPolicy(graph, chaining, rules.timeout)
         model = WalkModel()
         planner = Planner(graph, model, horizon(agent.env))  # never asked: the rules choose
+        policy = PaperPolicy(graph, chaining, rules.timeout, planner.horizon)
         runner = Runner(graph, planner, walker.actor, view, chaining.options, policy)
-        salience = find_salience(arguments, graph, store, agent)
+        salience = find_salience(arguments, graph, store, agent, relearn=1)
         missions: Any = PaperMissions(graph, chaining, salience, rules, arguments["exploration_steps"], rng)
-        witness: Any = PaperWitness(graph, chaining, agent.n_envs)
+        witness: Any = PaperWitness(graph, chaining, missions, agent.n_envs)
         rollout = common.rollout(runner, missions, witness, arguments)
         known = (rng, view_name, factory, store, walker, graph, model, planner, runner, missions, witness, rollout)
         return cls(*known, chaining, policy)
@@ -68,10 +68,15 @@ class PaperParts(Parts):
         """
         return self.policy.plan(state, point, goal)
 
-    def learners(self) -> list[Option]:
-        """Return the options that run now: each learns from its own runs."""
-        running = dict.fromkeys(self.rollout.state.option.tolist())
-        return [self.chaining.options[id] for id in running if id in self.chaining.options]
+    def learners(self, n_updates: int) -> list[tuple[Option, int]]:
+        """Return the options that have run since there was training, each with as many updates as it has earned by that.
+
+        :param n_updates: how many there would be if options had run all the time
+        """
+        rollout = self.rollout
+        earned = [(self.chaining.options[id], round(n_updates * n / rollout.n_steps)) for id, n in rollout.ran.items()]
+        rollout.ran, rollout.n_steps = {}, 0
+        return earned
 
     def get_state(self) -> dict[str, Any]:
         """Return what has been learned, the options' networks too, as plain data."""
@@ -90,6 +95,7 @@ class PaperParts(Parts):
         """Restore what :meth:`get_state` returned."""
         graph: Any = self.graph
         self.planner.horizon = state["horizon"]
+        self.policy.horizon = float(state["horizon"])
         graph.set_state(state["graph"])
         options: dict[str, Option] = {}
         for spec in state["options"]:  # an option's parent was made before it
@@ -114,4 +120,7 @@ class PaperParts(Parts):
         rows = transitions.pop("rows", {})
         super().set_experience(transitions)
         for id, option in self.chaining.options.items():
-            option.replay.set_state({"rows": rows[id]})
+            own = np.asarray(rows[id])
+            if own.ndim != 1 or (np.diff(own) <= 0).any() or not ((own >= 0) & (own < self.store.total)).all():
+                raise ValueError(f"The rows of option {id} in the file are none of a replay buffer of this size.")
+            option.replay.set_state({"rows": own})

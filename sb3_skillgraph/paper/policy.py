@@ -9,7 +9,7 @@ from sb3_skillgraph.options.option import Option
 from sb3_skillgraph.paper.chaining import DeepSkillChaining
 from sb3_skillgraph.paper.graph import PaperGraph
 from sb3_skillgraph.plan import Plan, Status
-from sb3_skillgraph.planning import DIRECT, GOAL
+from sb3_skillgraph.planning import DIRECT, GOAL, TIME_BINS
 from sb3_skillgraph.runner import Chosen, RunnerState
 
 
@@ -36,12 +36,14 @@ class PaperPolicy:
     :param graph: the skill graph
     :param chaining: the chains
     :param timeout: environment steps an option may run
+    :param horizon: environment steps within which a goal is to be reached
     """
 
-    def __init__(self, graph: PaperGraph, chaining: DeepSkillChaining, timeout: int) -> None:
+    def __init__(self, graph: PaperGraph, chaining: DeepSkillChaining, timeout: int, horizon: int) -> None:
         self.graph = graph
         self.chaining = chaining
         self.timeout = timeout
+        self.horizon = float(horizon)
 
     def choose(self, state: RunnerState, i: int, point: np.ndarray, goal: np.ndarray, stance: float) -> Chosen:
         """Choose the option that runs next.
@@ -54,7 +56,7 @@ class PaperPolicy:
         """
         way = self.way(state, i, point, goal)
         option = self.outside(point, goal) if way is None else self.chaining.options[way.vertices[0]]
-        event = self.graph.id(self.graph.locate(point))
+        event = self._here(point, goal)
         if option is None:
             return Chosen(DIRECT, event, goal, self.timeout)
         return Chosen(option.id, event, option.subgoal, self.timeout)
@@ -70,12 +72,14 @@ class PaperPolicy:
         :param goal: shape ``(goal_dim,)``
         """
         running = str(state.option[i])
-        able = [running] if running in self.graph.options else [o.id for o in self.graph.startable(point) if not running]
+        able = [option.id for option in self.graph.options.values() if not running and option.can_start(point)]
+        if running in self.graph.options:
+            able = [running]
         costs, ways = self.graph.ways_from(able)
         ends = [vertex for vertex in self._targets(goal) if vertex in costs]
         if ends:
             return Way(ways[min(ends, key=lambda vertex: costs[vertex] + self._runs(vertex))], at_goal=True)
-        here = self.graph.id(self.graph.locate(point))
+        here = self._here(point, goal)
         known = [event for event in self.graph.events if event.id in costs or event.id == here]
         if not known:
             return None
@@ -83,6 +87,11 @@ class PaperPolicy:
         if nearest == here or nearest in state.run_event[i]:
             return None
         return Way(ways[nearest], at_goal=False)
+
+    def _here(self, point: np.ndarray, goal: np.ndarray) -> str:
+        """Return the event that holds a point, of several the one nearest to the goal; an empty string if there is none."""
+        events = self.graph.events_at(point)
+        return min(events, key=lambda event: math.dist(event.center, goal)).id if events else ""
 
     def _runs(self, vertex: str) -> float:
         """Return how often an option at the end of a path is to be run; no edge says so."""
@@ -105,7 +114,7 @@ class PaperPolicy:
             if option is not None:
                 return option
         options = [option for option in self.chaining.options.values() if not option.terminates(point)]
-        able = [option for option in options if not option.mature or option.initiation.optimistic(point[None])[0]]
+        able = [option for option in options if option.can_start(point)]
         return min(able or options, key=lambda option: math.dist(option.subgoal, goal), default=None)
 
     # -- plans for people ---------------------------------------------------------------------------------------------
@@ -120,16 +129,33 @@ class PaperPolicy:
         """
         way, status = self.way(state, 0, point, goal), self._status(goal)
         if way is None:
-            return PaperPlan(status, (), math.inf, 0.0)
+            return PaperPlan(status, (), self.horizon, 0.0)
         if not way.at_goal:
-            return PaperPlan(status, tuple(way.vertices), math.inf, 0.0)
-        return PaperPlan(status, (*way.vertices, GOAL), *self._worth(way.vertices))
+            return PaperPlan(status, tuple(way.vertices), self.horizon, 0.0)
+        remaining = max(self.horizon - float(state.elapsed[0] - state.steps[0]), 1.0)
+        return PaperPlan(status, (*way.vertices, GOAL), *self.worth(way.vertices, remaining))
 
-    def _worth(self, vertices: list[str]) -> tuple[float, float]:
-        """Return the environment steps until every option on a way has succeeded, and how likely each does at once."""
+    def worth(self, vertices: list[str], remaining: float) -> tuple[float, float]:
+        """Tell what a way is worth, if a failed option is run again.
+
+        :param vertices: ids
+        :param remaining: environment steps that are left
+        :return: expected environment steps until every option has succeeded (all of them, where one never did), and the
+            probability that this is within those that are left
+        """
         options = [self.chaining.options[vertex] for vertex in vertices if vertex in self.chaining.options]
-        steps = sum(option.n_steps / max(option.n_successes, 1) for option in options)
-        return steps, math.prod(option.success_rate for option in options)
+        if not all(option.n_successes for option in options):
+            return self.horizon, 0.0
+        arrived = np.zeros(TIME_BINS + 1)  # by time bin, the probability to be done with the options so far
+        arrived[0] = 1.0
+        for option in options:
+            delay = max(round(option.n_steps / option.n_runs / remaining * TIME_BINS), 1)
+            begun, arrived = arrived, np.zeros_like(arrived)
+            for t in range(TIME_BINS + 1 - delay):
+                arrived[t + delay] += option.success_rate * begun[t]
+                begun[t + delay] += (1.0 - option.success_rate) * begun[t]
+        steps = sum(option.n_steps / option.n_successes for option in options)
+        return min(steps, self.horizon), float(arrived.sum())
 
     def links_from(self, event: str) -> list[tuple[str, str, float, float]]:
         """Return the ways from an event to others that pass no third one.
@@ -139,7 +165,7 @@ class PaperPolicy:
         """
         links = []
         for target, way in self.graph.ways_past_no_event(event).items():
-            steps, probability = self._worth(way)
+            steps, probability = self.worth(way, self.horizon)
             links.append((event, target, probability, steps))
         return links
 

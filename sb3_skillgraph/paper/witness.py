@@ -6,6 +6,7 @@ import numpy as np
 
 from sb3_skillgraph.paper.chaining import DeepSkillChaining
 from sb3_skillgraph.paper.graph import PaperGraph
+from sb3_skillgraph.paper.missions import PaperMissions
 from sb3_skillgraph.runner import Run
 
 
@@ -14,12 +15,14 @@ class PaperWitness:
 
     :param graph: the skill graph
     :param chaining: the chains and their options
+    :param missions: what the agent is about
     :param n_envs: number of environments
     """
 
-    def __init__(self, graph: PaperGraph, chaining: DeepSkillChaining, n_envs: int) -> None:
+    def __init__(self, graph: PaperGraph, chaining: DeepSkillChaining, missions: PaperMissions, n_envs: int) -> None:
         self.graph = graph
         self.chaining = chaining
+        self.missions = missions
         self.cut(n_envs)
 
     def cut(self, n_envs: int) -> None:
@@ -30,7 +33,15 @@ class PaperWitness:
         self._paths: list[list[np.ndarray]] = [[] for _ in range(n_envs)]
 
     def begin(self, env: int, point: np.ndarray) -> None:
-        """An episode begins: nothing follows from it."""
+        """An episode begins; where the very first does lies the first event, beta_0 of section 3.2.7.
+
+        :param env: which environment
+        :param point: where, shape ``(goal_dim,)``
+        """
+        if not self.graph.events:
+            self.graph.add_event(point)
+        if self.missions.pinned is not None:
+            self.missions.prepare()
 
     def began(self, env: int, point: np.ndarray) -> None:
         """A run begins.
@@ -60,12 +71,12 @@ class PaperWitness:
         if option is None:
             return
         *path, end = self._paths[run.env]
+        for event in self.graph.events_at(end) if not run.stuck else ():
+            self.graph.triggered(event.id, end)
         if run.success:
             self.chaining.succeeded(option, np.stack(path), end, run.steps)
         else:
             self.chaining.failed(option, None if run.stuck else path[0], run.steps)
-        if run.landing:
-            self.graph.triggered(run.landing, end)
 
     # -- saving -------------------------------------------------------------------------------------------------------
 

@@ -137,7 +137,7 @@ def _draw_runs(axes: Axes, agent: SkillGraphAgent, trajectory: Trajectory) -> No
         if begin == end:
             continue
         option = trajectory.options[begin]
-        label = "walk to the goal itself" if option == DIRECT else f"walk {option} to {targets.get(option, '?')}"
+        label = "walk to the goal itself" if option == DIRECT else f"{option} to {targets.get(option, '?')}"
         axes.plot(
             *points[begin : end + 1].T,
             color=_OPTION_COLORS[number % len(_OPTION_COLORS)],

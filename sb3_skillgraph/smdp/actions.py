@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from sb3_skillgraph.runner import Chosen, Runner, RunnerState
 Observation = dict[str, np.ndarray]
 
 
-class Run(NamedTuple):
+class Running(NamedTuple):
     """One action while it is being executed.
 
     :param id: the option's id, or ``primitive 0``, ...
@@ -23,6 +23,7 @@ class Run(NamedTuple):
     :param primitive: the primitive action, scaled to [-1, 1]; None for an option
     :param aim: where the option is to go, shape ``(goal_dim,)``
     :param timeout: environment steps it may take
+    :param single: whether it takes one step, whatever comes of it
     """
 
     id: str
@@ -30,12 +31,15 @@ class Run(NamedTuple):
     primitive: np.ndarray | None
     aim: np.ndarray
     timeout: float
+    single: bool = False
 
 
 class Actions(Protocol):
     """Options as actions, in the order of their making; last comes the walk straight to the goal, if there is one."""
 
     has_direct: bool
+    #: What must be remembered between two steps.
+    state: Any
 
     def reset(self, observation: Observation) -> None:
         """An episode begins."""
@@ -49,13 +53,13 @@ class Actions(Protocol):
     def masks(self, observation: Observation) -> np.ndarray:
         """Tell which of those can be taken, bool array of shape ``(n,)``."""
 
-    def begin(self, observation: Observation, action: int | None) -> Run:
+    def begin(self, observation: Observation, action: int | None) -> Running:
         """Begin to run an option; None for the walk straight to the goal."""
 
-    def act(self, run: Run, observation: Observation) -> np.ndarray:
+    def act(self, run: Running, observation: Observation) -> np.ndarray:
         """Return what it does, scaled to [-1, 1], shape ``(action_dim,)``."""
 
-    def fate(self, run: Run, observation: Observation, steps: int, stuck: bool) -> Fate:
+    def fate(self, run: Running, observation: Observation, steps: int, stuck: bool) -> Fate:
         """Tell what has become of it after so many steps."""
 
     def primitive(self) -> None:
@@ -80,6 +84,7 @@ class OptionActions:
         self.direct = direct
         self.timeout = timeout
         self.has_direct = direct is not None
+        self.state = None
 
     def reset(self, observation: Observation) -> None:
         """Nothing is remembered from step to step."""
@@ -97,25 +102,24 @@ class OptionActions:
     def masks(self, observation: Observation) -> np.ndarray:
         """Tell which options are mature and stand in their (optimistic) initiation set, not yet in their termination set."""
         point = np.asarray(observation["achieved_goal"])
-        able = [o.mature and bool(o.initiation.optimistic(point[None])[0]) and not o.terminates(point) for o in self.options]
-        return np.array(able, dtype=bool)
+        return np.array([option.mature and option.can_start(point) for option in self.options], dtype=bool)
 
-    def begin(self, observation: Observation, action: int | None) -> Run:
+    def begin(self, observation: Observation, action: int | None) -> Running:
         """Begin to run an option."""
         option = self.direct if action is None else self.options[action]
         assert option is not None
         if action is None:
-            return Run(option.id, option, None, np.asarray(observation["desired_goal"]), self.timeout // 2)
-        return Run(option.id, option, None, option.subgoal, self.timeout)
+            return Running(option.id, option, None, np.asarray(observation["desired_goal"]), self.timeout // 2)
+        return Running(option.id, option, None, option.subgoal, self.timeout)
 
-    def act(self, run: Run, observation: Observation) -> np.ndarray:
+    def act(self, run: Running, observation: Observation) -> np.ndarray:
         """Let its policy act."""
         assert run.option is not None
         seen = batch_of_one(observation)
         see = run.option.replay.view
         return run.option.actor.act(see(seen["observation"], seen["achieved_goal"], run.aim[None].astype(np.float32)))[0]
 
-    def fate(self, run: Run, observation: Observation, steps: int, stuck: bool = False) -> Fate:
+    def fate(self, run: Running, observation: Observation, steps: int, stuck: bool = False) -> Fate:
         """Tell whether it is where it leads, or at the goal."""
         point, option = np.asarray(observation["achieved_goal"]), run.option
         assert option is not None
@@ -139,7 +143,7 @@ class WalkActions:
     def __init__(self, runner: Runner) -> None:
         self.runner = runner
         self.ids: list[str] = []
-        self.state = RunnerState.fresh(1, runner.graph.goal_dim, 0)
+        self.state: Any = RunnerState.fresh(1, runner.graph.goal_dim, 0)
         self._action_of: dict[str, int] = {}
         self._chosen: Chosen | None = None
 
@@ -164,7 +168,7 @@ class WalkActions:
 
     def choices(self, observation: Observation) -> Choices:
         """Return what the agent could begin, as plans see it."""
-        point, goal = (np.asarray(observation[key]) for key in ("achieved_goal", "desired_goal"))
+        point, goal = (np.asarray(observation[key], dtype=np.float32) for key in ("achieved_goal", "desired_goal"))
         return self.runner.choices(self.state, 0, point, goal)
 
     def masks(self, observation: Observation) -> np.ndarray:
@@ -174,23 +178,23 @@ class WalkActions:
         mask[[self._action_of[walk_ids[i]] for i in self.choices(observation).target if i < len(walk_ids)]] = True
         return mask
 
-    def begin(self, observation: Observation, action: int | None) -> Run:
+    def begin(self, observation: Observation, action: int | None) -> Running:
         """Begin a walk, with the time that the agent would give it."""
-        point, goal = (np.asarray(observation[key]) for key in ("achieved_goal", "desired_goal"))
+        point, goal = (np.asarray(observation[key], dtype=np.float32) for key in ("achieved_goal", "desired_goal"))
         choices, graph = self.choices(observation), self.runner.graph
         target = len(graph.events) if action is None else graph.index(self.ids[action])
         row = int(np.flatnonzero(choices.target == target)[0])
         self._chosen = self.runner.option_of(choices, row, self.runner.start(self.state, 0, point), goal)
-        return Run(self._chosen.option, None, None, self._chosen.aim, self._chosen.timeout)
+        return Running(self._chosen.option, None, None, self._chosen.aim, self._chosen.timeout)
 
-    def act(self, run: Run, observation: Observation) -> np.ndarray:
+    def act(self, run: Running, observation: Observation) -> np.ndarray:
         """Let the walker act."""
         chosen, goals = self._chosen, np.asarray(observation["desired_goal"], dtype=np.float32)[None]
         assert chosen is not None
         scaled, self.state = self.runner.act(batch_of_one(observation), goals, self.state, choose=lambda *_: chosen)
         return scaled[0]
 
-    def fate(self, run: Run, observation: Observation, steps: int, stuck: bool = False) -> Fate:
+    def fate(self, run: Running, observation: Observation, steps: int, stuck: bool = False) -> Fate:
         """Let the runner tell whether the walk has ended."""
         points = np.asarray(observation["achieved_goal"], dtype=np.float32)[None]
         self.state, runs = self.runner.advance(self.state, points, [stuck])
@@ -201,5 +205,7 @@ class WalkActions:
         return Fate.SUCCEEDED if runs[0].success else Fate.TIMED_OUT
 
     def primitive(self) -> None:
-        """A step was taken: the agent is where it finds itself."""
-        self.state = self.state._replace(arrived=np.zeros_like(self.state.arrived), elapsed=self.state.elapsed + 1)
+        """A step was taken: nothing runs, and the agent is where it finds itself."""
+        none = np.zeros_like(self.state.arrived)
+        elapsed = self.state.elapsed + (self.state.option == "")  # else the walker took it
+        self.state = self.state._replace(option=none, arrived=none, elapsed=elapsed)

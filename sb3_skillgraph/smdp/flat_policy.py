@@ -5,7 +5,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from sb3_skillgraph.options.execution import Fate
-from sb3_skillgraph.smdp.actions import Run
+from sb3_skillgraph.smdp.actions import Running
 from sb3_skillgraph.smdp.options_env import MASK, OptionsEnv
 
 
@@ -52,16 +52,17 @@ class FlatPolicy:
         Act, and choose an option where the last one has ended.
 
         :param observation: one observation of the wrapped environment
-        :param state: what the last call returned: the running option, its steps, and the high level's own state
+        :param state: what the last call returned: the running option, its steps, the high level's own state, and what
+            the options remember
         :param episode_start: where an episode begins, and the state is forgotten; shape ``(1,)``
         :param deterministic: passed to the high level
         :return: the action, and the state
         """
         assert isinstance(observation, dict)
-        run: Run | None = None
+        run: Running | None = None
         steps, memory = 0, None
         if state is not None and not (episode_start is not None and np.any(episode_start)):
-            run, steps, memory = state[0].item(), int(state[1][0]), state[2].item()
+            run, steps, memory, self.env.actions.state = state[0].item(), int(state[1][0]), state[2].item(), state[3].item()
         else:
             self.env.actions.reset(observation)
         if run is not None and self.env.fate(run, observation, steps) != Fate.RUNNING:
@@ -70,7 +71,8 @@ class FlatPolicy:
             seen = {**observation, MASK: self.env.masks_at(observation).astype(np.int8)}
             action, memory = self.high_level.predict(seen, memory, None, deterministic)
             run = self.env.begin(observation, int(action))
-        return self.env.act(run, observation), (boxed(run), np.array([steps + 1]), boxed(memory))
+        action = self.env.act(run, observation)
+        return action, (boxed(run), np.array([steps + 1]), boxed(memory), boxed(self.env.actions.state))
 
 
 def boxed(item: Any) -> np.ndarray:

@@ -23,7 +23,7 @@ class GraphPolicy:
 
     def __init__(self, agent: Any, env: OptionsEnv) -> None:
         if not isinstance(env.actions, WalkActions) or env.actions.runner is not agent.parts.runner:
-            raise ValueError("The environment's options are not this agent's: give it OptionsEnv(env, agent.options).")
+            raise ValueError("The environment's options are not this agent's walks: give it OptionsEnv(env, agent.options).")
         self.env = env
         self.walks = env.actions
 
@@ -44,6 +44,7 @@ class GraphPolicy:
         :return: the action, and the state
         """
         assert isinstance(observation, dict)
-        point, goal = (np.asarray(observation[key]).reshape(-1) for key in ("achieved_goal", "desired_goal"))
+        point, goal = (np.asarray(observation[key], dtype=np.float32).reshape(-1) for key in ("achieved_goal", "desired_goal"))
         chosen = self.walks.runner.choose(self.walks.state, 0, point, goal, PESSIMISTIC)
-        return np.array(self.env.index(chosen.option)), state
+        action = np.array(self.env.index(chosen.option))
+        return (action[None] if np.ndim(observation["achieved_goal"]) == 2 else action), state

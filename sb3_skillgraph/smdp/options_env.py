@@ -10,8 +10,8 @@ from gymnasium import spaces
 
 from sb3_skillgraph.options.execution import Fate
 from sb3_skillgraph.options.option import Option
-from sb3_skillgraph.options.walk import Walk
-from sb3_skillgraph.smdp.actions import Actions, OptionActions, Run, WalkActions
+from sb3_skillgraph.options.walk import Walk, Walks
+from sb3_skillgraph.smdp.actions import Actions, OptionActions, Running, WalkActions
 
 MASK = "action_mask"
 MOST_AXES = 2  # up to so many dimensions of actions, primitive actions push along each axis
@@ -41,8 +41,8 @@ class OptionsEnv(gym.Wrapper):
     :param global_option: the option of that kind that walks to any goal
     :param primitives: actions scaled to [-1, 1], shape ``(n, action_dim)``; None takes both directions of every axis and
         standing still where actions have at most two dimensions, else one step of the walk straight to the goal
-    :param max_options: number of actions: room for options and primitive actions; by default 64, or what the agent's graph
-        may need
+    :param max_options: number of actions: room for options and primitive actions; by default 64, or for twice as many walks as
+        the agent's graph holds, since new events may take the place of merged ones
     :param gamma: discount factor per environment step
     :param timeout: environment steps an option may run; the global option, half of them. An agent's walks have times of
         their own
@@ -74,7 +74,7 @@ class OptionsEnv(gym.Wrapper):
         if max_options is None:
             max_options = N_OPTIONS
             if isinstance(self.actions, WalkActions):
-                max_options = self.actions.runner.graph.max_events + self.n_fixed
+                max_options = 2 * self.actions.runner.graph.max_events + self.n_fixed
         self.max_options = max_options
         self.action_space = spaces.Discrete(max_options)
         self.observation_space = spaces.Dict({**inner.spaces, MASK: spaces.MultiBinary(max_options)})
@@ -200,7 +200,7 @@ class OptionsEnv(gym.Wrapper):
         info = {**info, "tau": tau, "discount": discount, "option": run.id, "option_success": what == Fate.SUCCEEDED}
         return self._see(observation), total, terminated, truncated, info
 
-    def begin(self, observation: dict[str, np.ndarray], action: int) -> Run:
+    def begin(self, observation: dict[str, np.ndarray], action: int) -> Running:
         """Begin to execute an action.
 
         :param observation: of the wrapped environment
@@ -213,10 +213,10 @@ class OptionsEnv(gym.Wrapper):
             return self.actions.begin(observation, None)
         primitive = self.primitives[index]
         if primitive is None:
-            return self.actions.begin(observation, None)._replace(id=f"primitive {index}", timeout=1.0)
-        return Run(f"primitive {index}", None, primitive, np.asarray(observation["desired_goal"]), 1.0)
+            return self.actions.begin(observation, None)._replace(id=f"primitive {index}", timeout=1.0, single=True)
+        return Running(f"primitive {index}", None, primitive, np.asarray(observation["desired_goal"]), 1.0, single=True)
 
-    def act(self, run: Run, observation: dict[str, np.ndarray]) -> np.ndarray:
+    def act(self, run: Running, observation: dict[str, np.ndarray]) -> np.ndarray:
         """Return what a running option does.
 
         :param run: what :meth:`begin` returned
@@ -227,7 +227,7 @@ class OptionsEnv(gym.Wrapper):
         low, high = self._inner_space.low, self._inner_space.high
         return (low + 0.5 * (scaled.reshape(low.shape) + 1.0) * (high - low)).astype(self._inner_space.dtype)
 
-    def fate(self, run: Run, observation: dict[str, np.ndarray], steps: int, stuck: bool = False) -> Fate:
+    def fate(self, run: Running, observation: dict[str, np.ndarray], steps: int, stuck: bool = False) -> Fate:
         """Tell whether a running option goes on.
 
         :param run: what :meth:`begin` returned
@@ -235,7 +235,7 @@ class OptionsEnv(gym.Wrapper):
         :param steps: environment steps that it has run
         :param stuck: whether the agent can do nothing any more
         """
-        if run.primitive is None:
+        if not run.single:
             return self.actions.fate(run, observation, steps, stuck)
         self.actions.primitive()
         return Fate.STUCK if stuck else Fate.SUCCEEDED
@@ -247,9 +247,9 @@ class OptionsEnv(gym.Wrapper):
 
 def _actions(options: Sequence[Option] | Sequence[Walk], direct: Option | None, timeout: int) -> Actions:
     """Return what runs the options."""
-    walks = [option for option in options if isinstance(option, Walk)]
-    if not walks:
-        return OptionActions(options, direct, timeout)  # type: ignore[arg-type]
-    if len(walks) < len(options) or direct is not None:
-        raise ValueError("An agent's options have the walk straight to the goal among them, and go with no others.")
-    return WalkActions(walks[0].runner)
+    if isinstance(options, Walks) and direct is None:
+        return WalkActions(options.runner)
+    others = [option for option in options if isinstance(option, Option)]
+    if len(others) < len(options) or isinstance(options, Walks):
+        raise ValueError("Walks go with no other options, and bring the walk straight to the goal along: give agent.options.")
+    return OptionActions(options, direct, timeout)  # type: ignore[arg-type]
