@@ -168,6 +168,9 @@ def success_radius(get: Callable[[str], Any]) -> Any:
         radius = get(name)
         if radius is not None:
             return radius
+    of_task = getattr(get("task"), "distance_threshold", None)  # as panda-gym has it
+    if of_task is not None:
+        return of_task
     # gymnasium-robotics' mazes have a number in their code, and no name for it.
     return ROBOTICS_MAZE_RADIUS if hasattr(get("maze"), "maze_size_scaling") else None
 

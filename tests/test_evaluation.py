@@ -2,6 +2,7 @@
 
 import copy
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium as gym
@@ -234,6 +235,16 @@ def test_environments_without_walls_draw_starts_and_goals_themselves(trained: Sk
     with pytest.raises(ValueError, match="To adapt, the environment must take"):
         gym.register("Bare-v0", Bare)
         evaluate_pairs(trained, "Bare-v0", n_pairs=1, adapt_timesteps=10)
+
+
+def test_a_task_may_know_the_radius() -> None:
+    class Tasked(Bare):
+        task = SimpleNamespace(distance_threshold=0.3)
+
+    agent = new_agent(Tasked())
+    assert agent.event_radius == 0.3
+    result = evaluate_pairs(RandomWalk(), Tasked(), n_pairs=5)
+    assert all(pair.success == (pair.nearest <= 0.3) for pair in result.pairs)
 
 
 @pytest.mark.mujoco

@@ -150,7 +150,7 @@ def test_every_run_is_drawn_and_the_plan_beside_it(agent: SkillGraphAgent, env: 
     runs = [option for option, _ in itertools.groupby(trajectory.options)]
     assert len(runs) >= 2
     targets = {option.id: option.target for option in agent.options}
-    labels = ["walk to the goal itself" if run == DIRECT else f"walk {run} to {targets[run]}" for run in runs]
+    labels = ["walk to the goal itself" if run == DIRECT else f"{run} to {targets[run]}" for run in runs]
     planned, *walked, start, goal = axes.lines
     assert [line.get_label() for line in walked] == labels
     np.testing.assert_allclose(np.concatenate([line.get_xydata()[1:] for line in walked]), trajectory.points[1:])
