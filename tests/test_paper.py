@@ -347,6 +347,7 @@ def test_failures_shrink_where_an_option_starts() -> None:
         chaining.failed(root, np.array([1.0, 0.0]), 200)
     assert not root.initiation.optimistic(np.array([[1.0, 0.0]]))[0]
     assert root.success_rate == pytest.approx(3 / 11)
+    assert repr(root) == "<option o0 to e1: 3 of 11 runs succeeded>"
     before = len(root.initiation.failures)
     chaining.failed(root, None, 5)  # stuck: where it began is not to blame
     assert len(root.initiation.failures) == before

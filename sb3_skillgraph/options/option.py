@@ -53,6 +53,10 @@ class Option:
         self.effects: deque[np.ndarray] = deque(maxlen=EFFECTS_LENGTH)
         self._actor: NumpyActor | None = None
 
+    def __repr__(self) -> str:
+        age = "" if self.mature else ", gestating"
+        return f"<option {self.id} to {self.target}{age}: {self.n_successes} of {self.n_runs} runs succeeded>"
+
     @property
     def replay(self) -> OptionReplay:
         """The option's view of the shared store."""
