@@ -24,12 +24,14 @@ class PaperGraph(SkillGraph):
     option, option the effect set of the first lies in the          1 / success rate
                    initiation set of the second
     option, event  the effect set lies in the event                 1 / success rate
-    event, option  all points at which the event was triggered lie  0: to be in the event is to be able
-                   in the option's initiation set                   to start the option
+    event, option  all points at which the event was triggered lay  0: to be in the event is to be able
+                   in the option's initiation set when it was       to start the option
+                   looked at
     ============== ================================================ ====================================
 
-    An edge goes as soon as one point falls outside. There are no landmarks, no walks and no cover: a point that lies in no
-    salient event belongs to none.
+    An edge out of an option goes as soon as one effect falls outside. Of those out of events the paper says no such thing, and
+    they stay: a chain that is complete stays so (section A.3). There are no landmarks, no walks and no cover: a point that
+    lies in no salient event belongs to none.
 
     :param goal_dim: dimension of goal space
     :param radius: radius of the events, in goal units
@@ -87,9 +89,6 @@ class PaperGraph(SkillGraph):
         :param point: where, shape ``(goal_dim,)``
         """
         self.triggers[event].append(np.asarray(point, dtype=np.float64))
-        for option in self.options.values():
-            self._event_option_edge(event, option)
-        self.version += 1
 
     def refresh(self, option: Option, refitted: bool) -> None:
         """Look again at the edges of an option after one of its runs.
@@ -129,8 +128,6 @@ class PaperGraph(SkillGraph):
         startable = option.initiation.optimistic(np.stack(self.triggers[event])).all()
         if startable and option.target != event:  # an option does not start where it ends
             self._digraph.add_edge(event, option.id, weight=0.0, success_rate=1.0)
-        elif self._digraph.has_edge(event, option.id):
-            self._digraph.remove_edge(event, option.id)
 
     # -- questions ----------------------------------------------------------------------------------------------------
 
@@ -204,9 +201,13 @@ class PaperGraph(SkillGraph):
     # -- saving -------------------------------------------------------------------------------------------------------
 
     def get_state(self) -> dict[str, Any]:
-        """Return events, what triggered them and which options are vertices; edges follow from sets."""
-        triggers = {id: np.stack(points) for id, points in self.triggers.items()}
-        return {"events": [event.center for event in self.events], "triggers": triggers, "options": list(self.options)}
+        """Return events, what triggered them, which options are vertices, and the edges, all in their order."""
+        return {
+            "events": [event.center for event in self.events],
+            "triggers": {id: np.stack(points) for id, points in self.triggers.items()},
+            "options": list(self.options),
+            "edges": [[u, v, dict(data)] for u, v, data in self._digraph.edges(data=True)],
+        }
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Restore the events of what :meth:`get_state` returned; options come with :meth:`set_options`."""
@@ -214,13 +215,13 @@ class PaperGraph(SkillGraph):
             self.add_event(center)
         self.triggers = {id: deque(points, maxlen=TRIGGERS_LENGTH) for id, points in state["triggers"].items()}
 
-    def set_options(self, ids: Iterable[str], options: dict[str, Option]) -> None:
+    def set_options(self, state: dict[str, Any], options: dict[str, Option]) -> None:
         """Restore which options are vertices, and all edges.
 
-        :param ids: their ids
+        :param state: what :meth:`get_state` returned
         :param options: all options by id
         """
-        for id in ids:
+        for id in state["options"]:
             self.add_option(options[id])
-        for option in self.options.values():
-            self.refresh(option, refitted=True)
+        for source, target, data in state["edges"]:
+            self._digraph.add_edge(source, target, **data)

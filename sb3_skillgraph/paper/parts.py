@@ -107,7 +107,7 @@ class PaperParts(Parts):
             persistence.set_parameters(option.learner, spec["parameters"], True, self.factory.device)
             options[option.id] = option
         self.chaining.set_state(state["chaining"], list(options.values()))
-        graph.set_options(state["graph"]["options"], options)
+        graph.set_options(state["graph"], options)
 
     def get_experience(self) -> dict[str, Any]:
         """Return what goes with the replay buffer: the transitions, and which of them are which option's own."""
