@@ -9,6 +9,7 @@ from stable_baselines3 import DDPG, SAC, TD3
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_skillgraph.edges import NOWHERE
 from sb3_skillgraph.goal_env import GoalSpec, Oracle, env_attribute, find_view, success_radius
 from sb3_skillgraph.graph import SkillGraph
 from sb3_skillgraph.learning.dco import LEARN_EVERY, DCOSalience
@@ -17,11 +18,12 @@ from sb3_skillgraph.learning.rollout import Rollout
 from sb3_skillgraph.learning.salience import FrontierSalience, RandomSalience, Salience
 from sb3_skillgraph.learning.witness import Witness
 from sb3_skillgraph.memory.store import TransitionStore
-from sb3_skillgraph.options.factory import OptionFactory
+from sb3_skillgraph.options.factory import OptionFactory, copy_policy
 from sb3_skillgraph.options.learner import OptionDDPG, OptionLearner, OptionTD3
 from sb3_skillgraph.options.option import Option
 from sb3_skillgraph.options.views import ScaledView
 from sb3_skillgraph.options.walk import Walk, Walks
+from sb3_skillgraph.persistence import set_skill_state, skill_state
 from sb3_skillgraph.plan import Plan, describe
 from sb3_skillgraph.planning import Planner
 from sb3_skillgraph.runner import Runner, RunnerState
@@ -119,6 +121,7 @@ class Parts:
     missions: Missions
     witness: Witness
     rollout: Rollout
+    skills: dict[str, Option]
 
     @classmethod
     def build(cls, agent: OffPolicyAlgorithm, spec: GoalSpec, arguments: dict[str, Any]) -> "Parts":
@@ -133,7 +136,8 @@ class Parts:
         graph = SkillGraph(spec.goal_dim, radius, arguments["max_events"], arguments["walk_steps"])
         model = WalkModel()
         planner = Planner(graph, model, horizon(agent.env))
-        runner = Runner(graph, planner, walker.actor, view)
+        skills: dict[str, Option] = {}
+        runner = Runner(graph, planner, walker.actor, view, skills)
         missions = Missions(
             graph,
             find_salience(arguments, graph, store, agent),
@@ -143,13 +147,30 @@ class Parts:
         )
         witness = Witness(graph, planner.choice_model, agent.n_envs)
         rollout = common.rollout(runner, missions, witness, arguments)
-        return cls(rng, view_name, factory, store, walker, graph, model, planner, runner, missions, witness, rollout)
+        return cls(rng, view_name, factory, store, walker, graph, model, planner, runner, missions, witness, rollout, skills)
 
     def options(self) -> Any:
         """Return all options: the walks, one to each event, which share their SB3 model."""
-        graph, learner = self.graph, self.walker.learner
-        walks = (Walk(id, event, learner) for id, event in zip(graph.walk_ids, graph.events, strict=True))
-        return Walks(walks, self.runner)
+        graph, walker = self.graph, self.walker
+        learners = [self.skills.get(id, walker).learner for id in graph.walk_ids]
+        known = zip(graph.walk_ids, graph.events, learners, strict=True)
+        return Walks((Walk(*each, self.specialise) for each in known), self.runner)
+
+    def specialise(self, walk: str) -> Option:
+        """Put a skill in the place of a walk (see :meth:`Walk.specialise`).
+
+        :param walk: id of the walk
+        """
+        if walk not in self.skills:
+            self.skills[walk] = self._make_skill(walk)
+            copy_policy(self.walker, self.skills[walk])
+        return self.skills[walk]
+
+    def _make_skill(self, walk: str) -> Option:
+        event = self.graph.events[self.graph.index(walk)]
+        skill = self.factory.make(walk, event.id, event)
+        skill.mature = True
+        return skill
 
     def plan(self, state: RunnerState, point: np.ndarray, goal: np.ndarray) -> Plan:
         """Tell how the agent goes about a goal.
@@ -161,29 +182,53 @@ class Parts:
         return describe(self.runner, state, point, goal)
 
     def learners(self, n_updates: int) -> list[tuple[Option, int]]:
-        """Return the options whose networks learn now, each with its number of updates.
+        """Return the options whose networks learn now, each with its number of updates: of a skill as many as it has run.
 
-        :param n_updates: how many there are to be
+        :param n_updates: how many there are to be, if an option has run all the time
         """
-        return [(self.walker, n_updates)]
+        return [(self.walker, n_updates), *self._having_run(n_updates)]
+
+    def _having_run(self, n_updates: int) -> list[tuple[Option, int]]:
+        """Return the skills that have run since there was training."""
+        rollout, skills = self.rollout, self.runner.skills
+        earned = [(skills[id], round(n_updates * n / rollout.n_steps)) for id, n in rollout.ran.items() if id in skills]
+        rollout.ran, rollout.n_steps = {}, 0
+        return earned
 
     def get_state(self) -> dict[str, Any]:
         """Return what has been learned beside the walker's networks, as plain data."""
-        return {"horizon": self.planner.horizon, "graph": self.graph.get_state(), "model": self.model.get_state()}
+        skills = [skill_state(skill) for id, skill in self.skills.items() if self.graph.index(id) != NOWHERE]
+        learned = {"graph": self.graph.get_state(), "model": self.model.get_state(), "skills": skills}
+        return {"horizon": self.planner.horizon, **learned}
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Restore what :meth:`get_state` returned."""
         self.planner.horizon = state["horizon"]
         self.graph.set_state(state["graph"])
         self.model.set_state(state["model"])
+        for spec in state["skills"]:
+            skill = self._make_skill(spec["record"]["id"])
+            set_skill_state(skill, spec, self.factory.device)
+            self.skills[skill.id] = skill
 
     def get_experience(self) -> dict[str, Any]:
-        """Return what goes with the replay buffer, as plain data."""
-        return self.store.get_state()
+        """Return what goes with the replay buffer, as plain data: the transitions, and which of them are which skill's own."""
+        rows = {id: skill.replay.get_state()["rows"] for id, skill in self.runner.skills.items()}
+        return {**self.store.get_state(), "rows": rows}
 
     def set_experience(self, state: dict[str, Any]) -> None:
-        """Restore what :meth:`get_experience` returned."""
-        self.store.set_state(state)
+        """Restore what :meth:`get_experience` returned.
+
+        :raises ValueError: if it does not fit
+        """
+        transitions = dict(state)
+        rows = transitions.pop("rows", {})
+        self.store.set_state(transitions)
+        for id, skill in self.runner.skills.items():
+            own = np.asarray(rows[id])
+            if own.ndim != 1 or (np.diff(own) <= 0).any() or not ((own >= 0) & (own < self.store.total)).all():
+                raise ValueError(f"The rows of option {id} in the file are none of a replay buffer of this size.")
+            skill.replay.set_state({"rows": own})
 
     def unscale(self, scaled: np.ndarray) -> np.ndarray:
         """Turn actions in [-1, 1], shape ``(n, action_dim)``, into the environment's own, shape ``(n, *action_shape)``."""

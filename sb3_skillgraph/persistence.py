@@ -245,6 +245,25 @@ def set_parameters(learner: OffPolicyAlgorithm, given: dict[str, Any], exact_mat
     learner.set_parameters(given, exact_match, device)
 
 
+def skill_state(skill: Any) -> dict[str, Any]:
+    """Return an option with a network of its own as plain data.
+
+    :param skill: an :class:`~sb3_skillgraph.options.option.Option`
+    """
+    return {"record": skill.get_state(), "parameters": parameters(skill.learner)}
+
+
+def set_skill_state(skill: Any, state: dict[str, Any], device: Any) -> None:
+    """Restore what :func:`skill_state` returned.
+
+    :param skill: a new option
+    :param state: the state
+    :param device: torch device
+    """
+    skill.set_state(state["record"])
+    set_parameters(skill.learner, state["parameters"], True, device)
+
+
 def load_parameters(learner: OffPolicyAlgorithm, tree: dict[str, Any], exact_match: bool, device: Any) -> None:
     """Set the parameters that a saved agent has; all of them, or none.
 

@@ -211,8 +211,9 @@ class Runner:
 
     def _run(self, state: RunnerState, i: int, point: np.ndarray, arrived: bool, lost: bool) -> Run:
         option = str(state.option[i])
-        if arrived and option not in self.skills:
-            landing = GOAL if option == DIRECT else self.graph.id(self.graph.index(option))
+        index = self.graph.index(option)
+        if arrived and (index != NOWHERE or option not in self.skills):
+            landing = GOAL if option == DIRECT else self.graph.id(index)
         else:
             landing = "" if lost else self.graph.id(self.graph.locate(point))
         stood_still = not (arrived or lost) and state.still[i] >= STILL_STEPS

@@ -33,7 +33,7 @@ FLOORS: dict[str, float] = {
     "plan": 9,  # the runner's plans for people to read
     "learning": 9,
     "parts": 10,  # how all of these are put together
-    "persistence": 10,
+    "persistence": 9,
     "paper": 10.5,  # what PAPER does instead
     "agent": 11,
     "smdp": 11,  # on options, not on the agent

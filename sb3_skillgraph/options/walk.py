@@ -1,12 +1,13 @@
 """Walks: the options that share one goal-conditioned policy, the walker."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_skillgraph.events import Event
+from sb3_skillgraph.options.option import Option
 
 
 class Walk:
@@ -17,17 +18,29 @@ class Walk:
     :param id: its name, and that of its vertex in the skill graph
     :param target: id of the event it leads to
     :param termination: the event it leads to, where it ends
-    :param learner: the SB3 model of the walker, which all walks share
+    :param learner: the SB3 model of the walker, which all walks share, or that of the skill in its place
+    :param specialise: gives it a network of its own
     """
 
-    def __init__(self, id: str, termination: Event, learner: OffPolicyAlgorithm) -> None:
+    def __init__(self, id: str, termination: Event, learner: OffPolicyAlgorithm, specialise: Callable[[str], Option]) -> None:
         self.id = id
         self.target = termination.id
         self.termination = termination
         self.learner = learner
+        self._specialise = specialise
 
     def __repr__(self) -> str:
         return f"<walk {self.id} to {self.target}>"
+
+    def specialise(self) -> Option:
+        """Give it a network of its own, which begins as a copy of the walker's.
+
+        From now on the agent runs this skill in place of the walk, and it learns whenever it runs: half of each minibatch is
+        from its own runs, half from all experience.
+
+        :return: the skill, the same at every call
+        """
+        return self._specialise(self.id)
 
     @property
     def subgoal(self) -> np.ndarray:

@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_skillgraph import persistence
 from sb3_skillgraph.goal_env import GoalSpec
 from sb3_skillgraph.options.option import Option
 from sb3_skillgraph.paper.chaining import DeepSkillChaining
@@ -15,6 +14,7 @@ from sb3_skillgraph.paper.missions import PaperMissions
 from sb3_skillgraph.paper.policy import PaperPolicy
 from sb3_skillgraph.paper.witness import PaperWitness
 from sb3_skillgraph.parts import Common, Parts, find_salience, horizon
+from sb3_skillgraph.persistence import set_skill_state, skill_state
 from sb3_skillgraph.plan import Plan
 from sb3_skillgraph.planning import Planner
 from sb3_skillgraph.runner import Runner, RunnerState
@@ -53,7 +53,7 @@ class PaperParts(Parts):
         witness: Any = PaperWitness(graph, chaining, missions, agent.n_envs)
         rollout = common.rollout(runner, missions, witness, arguments)
         known = (rng, view_name, factory, store, walker, graph, model, planner, runner, missions, witness, rollout)
-        return cls(*known, chaining, policy)
+        return cls(*known, chaining.options, chaining, policy)
 
     def options(self) -> list[Any]:
         """Return all options, gestating ones too, in the order of their making."""
@@ -69,21 +69,15 @@ class PaperParts(Parts):
         return self.policy.plan(state, point, goal)
 
     def learners(self, n_updates: int) -> list[tuple[Option, int]]:
-        """Return the options that have run since there was training, each with as many updates as it has earned by that.
+        """Return the options that have run since there was training, each with as many updates as it has run.
 
-        :param n_updates: how many there would be if options had run all the time
+        :param n_updates: how many there are to be, if an option has run all the time
         """
-        rollout = self.rollout
-        earned = [(self.chaining.options[id], round(n_updates * n / rollout.n_steps)) for id, n in rollout.ran.items()]
-        rollout.ran, rollout.n_steps = {}, 0
-        return earned
+        return self._having_run(n_updates)
 
     def get_state(self) -> dict[str, Any]:
         """Return what has been learned, the options' networks too, as plain data."""
-        options = [
-            {"record": option.get_state(), "parameters": persistence.parameters(option.learner)}
-            for option in self.chaining.options.values()
-        ]
+        options = [skill_state(option) for option in self.chaining.options.values()]
         return {
             "horizon": self.planner.horizon,
             "graph": self.graph.get_state(),
@@ -103,24 +97,7 @@ class PaperParts(Parts):
             event = graph.index(record["target"])
             termination = graph.events[event] if event >= 0 else options[record["target"]]
             option = self.factory.make(record["id"], record["target"], termination)
-            option.set_state(record)
-            persistence.set_parameters(option.learner, spec["parameters"], True, self.factory.device)
+            set_skill_state(option, spec, self.factory.device)
             options[option.id] = option
         self.chaining.set_state(state["chaining"], list(options.values()))
         graph.set_options(state["graph"], options)
-
-    def get_experience(self) -> dict[str, Any]:
-        """Return what goes with the replay buffer: the transitions, and which of them are which option's own."""
-        rows = {id: option.replay.get_state()["rows"] for id, option in self.chaining.options.items()}
-        return {**super().get_experience(), "rows": rows}
-
-    def set_experience(self, state: dict[str, Any]) -> None:
-        """Restore what :meth:`get_experience` returned."""
-        transitions = dict(state)
-        rows = transitions.pop("rows", {})
-        super().set_experience(transitions)
-        for id, option in self.chaining.options.items():
-            own = np.asarray(rows[id])
-            if own.ndim != 1 or (np.diff(own) <= 0).any() or not ((own >= 0) & (own < self.store.total)).all():
-                raise ValueError(f"The rows of option {id} in the file are none of a replay buffer of this size.")
-            option.replay.set_state({"rows": own})

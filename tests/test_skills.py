@@ -1,0 +1,106 @@
+"""A walk with a network of its own."""
+
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from conftest import TOY, differences, state_of, without_clock
+from stable_baselines3 import DDPG
+
+from sb3_skillgraph import OptionEnv, OptionsEnv, SkillGraphAgent
+from sb3_skillgraph.options.walk import Walk
+
+
+def busiest(agent: SkillGraphAgent) -> int:
+    """The event that most runs have led to."""
+    edges = agent.graph.edges
+    return int(np.bincount(edges.target, edges.successes, len(agent.events)).argmax())
+
+
+def weights(option: object) -> np.ndarray:
+    return option.learner.policy.actor.mu[0].weight.detach().numpy().copy()  # type: ignore[attr-defined]
+
+
+def test_a_skill_begins_as_the_walk_and_learns_from_its_runs(trained: SkillGraphAgent) -> None:
+    walk = trained.options[busiest(trained)]
+    assert isinstance(walk, Walk)
+    skill = walk.specialise()
+    assert walk.specialise() is skill
+    assert skill.id == walk.id
+    after = next(option for option in trained.options if option.id == walk.id)
+    assert after.learner is skill.learner is not trained.parts.walker.learner
+    np.testing.assert_array_equal(weights(skill), weights(trained.parts.walker))
+    trained.learn(3000, log_interval=None, reset_num_timesteps=False)
+    own = skill.replay._readable()
+    assert len(own) > 64
+    assert 0 < skill.learner._n_updates <= len(own)
+    np.testing.assert_array_equal(trained.parts.store.column("goal", own), np.float32([skill.subgoal] * len(own)))
+    assert not np.array_equal(weights(skill), weights(trained.parts.walker))
+
+
+def test_predict_runs_the_skill_in_place_of_the_walk(trained: SkillGraphAgent) -> None:
+    event = busiest(trained)
+    goal = trained.events[event].center.astype(np.float32)
+    source = int(trained.graph.edges.source[trained.graph.edges.target == event][0])
+    env = gym.make(TOY)
+    observation, _ = env.reset(options={"start": trained.events[source].center, "goal": goal})
+    before = trained.plan(observation).path
+    for option in trained.options:
+        skill = option.specialise()
+        with np.errstate(all="ignore"):
+            for parameter in skill.learner.policy.actor.parameters():
+                parameter.data.zero_()
+    assert trained.plan(observation).path == before, "a plan speaks of the same option"
+    action, state = trained.predict(observation)
+    assert trained.running(state) == [before[0]]  # type: ignore[arg-type]
+    if before[0] != "direct":
+        np.testing.assert_array_equal(action, np.zeros(2))
+    # Whoever arrives by a skill is in the event that it leads to.
+    runner, option = trained.parts.runner, trained.options[event]
+    running = runner.act({k: v[None] for k, v in observation.items()}, goal[None], _fresh(trained))[1]
+    running = running._replace(option=np.array([option.id]), aim=option.subgoal[None])
+    ended, (run,) = runner.advance(running, np.float32([option.subgoal]))
+    assert (run.success, run.landing, ended.arrived[0]) == (True, option.target, option.target)
+
+
+def _fresh(agent: SkillGraphAgent) -> object:
+    return agent._running_state(1, None)
+
+
+@pytest.mark.usefixtures("one_thread")
+def test_skills_are_saved_and_learning_goes_on_exactly(trained: SkillGraphAgent, tmp_path: Path) -> None:
+    trained.options[busiest(trained)].specialise()
+    trained.learn(600, log_interval=None, reset_num_timesteps=False)
+    trained.save(tmp_path / "agent")
+    trained.save_replay_buffer(tmp_path / "replay")
+    twin = SkillGraphAgent.load(tmp_path / "agent", env=gym.make(TOY))
+    twin.load_replay_buffer(tmp_path / "replay")
+    assert twin.parts.skills.keys() == trained.parts.skills.keys()
+    for agent in (trained, twin):
+        agent.learn(400, log_interval=None, reset_num_timesteps=False)
+    assert differences(without_clock(state_of(trained)), without_clock(state_of(twin))) == []
+
+
+def test_a_skill_works_wherever_options_do(trained: SkillGraphAgent) -> None:
+    skill = trained.options[busiest(trained)].specialise()
+    DDPG("MlpPolicy", OptionEnv(gym.make(TOY), skill.termination), learning_starts=10).learn(20)  # type: ignore[arg-type]
+    env = OptionsEnv(gym.make(TOY, max_steps=60), trained.options)
+    observation, _ = env.reset(seed=0)
+    for _ in range(5):
+        observation, _, _, over, info = env.step(int(np.flatnonzero(observation["action_mask"])[0]))
+        assert info["tau"] >= 1
+        if over:
+            break
+
+
+def test_a_skill_goes_with_its_event(trained: SkillGraphAgent, tmp_path: Path) -> None:
+    for option in trained.options:
+        option.specialise()
+    n_before = len(trained.parts.skills)
+    trained.graph.coarsen()
+    trained.save(tmp_path / "agent")
+    loaded = SkillGraphAgent.load(tmp_path / "agent", env=gym.make(TOY))
+    assert loaded.parts.skills.keys() == set(loaded.graph.walk_ids)
+    assert len(loaded.parts.skills) < n_before
+    loaded.learn(200, log_interval=None, reset_num_timesteps=False)
