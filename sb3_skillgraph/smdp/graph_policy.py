@@ -13,7 +13,7 @@ class GraphPolicy:
     """
     Chooses on an :class:`~sb3_skillgraph.OptionsEnv` the option that the agent's ``predict`` would run.
 
-    It has SB3's ``predict`` and so is exchangeable with :class:`~sb3_skillgraph.SMDPQLearning` on the same environment. What
+    With ``**PAPER`` there are no walks: then the agent's own ``predict`` is its high level. It has SB3's ``predict`` and so is exchangeable with :class:`~sb3_skillgraph.SMDPQLearning` on the same environment. What
     has happened in the episode it takes from the environment, which keeps the agent's record of it.
 
     :param agent: a :class:`~sb3_skillgraph.SkillGraphAgent`, which plans over its graph

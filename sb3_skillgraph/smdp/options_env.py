@@ -29,7 +29,7 @@ class OptionsEnv(gym.Wrapper):
 
     Observations gain an entry ``action_mask``, which :meth:`action_masks` returns as well: an option may run if it can start.
     There may be more options with time; no action ever changes its meaning, and those of options still unborn, or gone, are
-    masked.
+    masked. (Another environment, made after events of the agent's graph were merged, numbers its walks anew.)
 
     Where the agent gets stuck (``info["stuck"]``) the episode is over, and costs are added up as if it stood there for
     ever. A ``Monitor`` belongs around this environment, not into it: from inside it does not see such an end.
