@@ -13,8 +13,9 @@ class GraphPolicy:
     """
     Chooses on an :class:`~sb3_skillgraph.OptionsEnv` the option that the agent's ``predict`` would run.
 
-    With ``**PAPER`` there are no walks: then the agent's own ``predict`` is its high level. It has SB3's ``predict`` and so is exchangeable with :class:`~sb3_skillgraph.SMDPQLearning` on the same environment. What
-    has happened in the episode it takes from the environment, which keeps the agent's record of it.
+    It has SB3's ``predict`` and so is exchangeable with :class:`~sb3_skillgraph.SMDPQLearning` on the same environment. What
+    has happened in the episode it takes from the environment, which keeps the agent's record of it. With ``**PAPER`` there are
+    no walks: there the agent's own ``predict`` is all there is.
 
     :param agent: a :class:`~sb3_skillgraph.SkillGraphAgent`, which plans over its graph
     :param env: lifted by the agent's options; predictions are for where it stands
