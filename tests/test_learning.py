@@ -144,15 +144,6 @@ def test_action_noise_may_be_a_number() -> None:
     np.testing.assert_array_equal(actions_with(0.5), strong)
 
 
-@pytest.mark.skip(reason="PAPER rests until skills are built on the graph of walks")
-def test_the_paper_as_written() -> None:
-    from sb3_skillgraph import PAPER
-
-    agent = new_agent(**PAPER).learn(1500)
-    assert len(agent.events) >= 3
-    assert any(option.learner is not agent.parts.walker.learner for option in agent.options)
-
-
 @pytest.mark.parametrize(
     "arguments",
     [
