@@ -14,7 +14,8 @@ from sb3_skillgraph.plan import Plan
 from sb3_skillgraph.planning import DIRECT
 from sb3_skillgraph.plotting import figures
 
-_OPTION_COLORS = colormaps["tab10"].colors  # type: ignore[attr-defined]
+_PALETTE = colormaps["tab20"].colors  # type: ignore[attr-defined]
+_OPTION_COLORS = (*_PALETTE[::2], *_PALETTE[1::2])  # the strong ones first: as many as runs are named, all different
 _GOAL_COLOR, _START_COLOR, _PLAN_COLOR = "#d62728", "#2ca02c", "#111111"
 #: Runs of options that the legend names; more would not fit.
 MAX_NAMED = 14
