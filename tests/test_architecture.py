@@ -32,6 +32,7 @@ FLOORS: dict[str, float] = {
     "runner": 8,
     "plan": 9,  # the runner's plans for people to read
     "learning": 9,
+    "arguments": 9.5,  # the agent's, checked
     "parts": 10,  # how all of these are put together
     "persistence": 9,
     "paper": 10.5,  # what PAPER does instead

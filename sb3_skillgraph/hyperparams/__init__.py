@@ -9,7 +9,7 @@ from typing import Any
 import yaml
 
 from sb3_skillgraph.agent import SkillGraphAgent
-from sb3_skillgraph.parts import OPTION_CLASSES
+from sb3_skillgraph.arguments import OPTION_CLASSES
 from sb3_skillgraph.rules import PAPER
 
 FILE = Path(__file__).parent / "skillgraph.yml"

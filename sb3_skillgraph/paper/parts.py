@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
+from sb3_skillgraph.arguments import find_salience, horizon
 from sb3_skillgraph.goal_env import GoalSpec
 from sb3_skillgraph.options.option import Option
 from sb3_skillgraph.paper.chaining import DeepSkillChaining
@@ -13,7 +14,7 @@ from sb3_skillgraph.paper.graph import PaperGraph
 from sb3_skillgraph.paper.missions import PaperMissions
 from sb3_skillgraph.paper.policy import PaperPolicy
 from sb3_skillgraph.paper.witness import PaperWitness
-from sb3_skillgraph.parts import Common, Parts, find_salience, horizon
+from sb3_skillgraph.parts import Common, Parts
 from sb3_skillgraph.persistence import set_skill_state, skill_state
 from sb3_skillgraph.plan import Plan
 from sb3_skillgraph.planning import Planner

@@ -1,0 +1,167 @@
+"""An agent's arguments: what they may be, and what follows from them and from the environment."""
+
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from stable_baselines3 import DDPG, SAC, TD3
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_skillgraph.goal_env import Oracle, env_attribute, success_radius
+from sb3_skillgraph.graph import SkillGraph
+from sb3_skillgraph.learning.dco import LEARN_EVERY, DCOSalience
+from sb3_skillgraph.learning.salience import FrontierSalience, RandomSalience, Salience
+from sb3_skillgraph.memory.store import TransitionStore
+from sb3_skillgraph.options.learner import OptionDDPG, OptionLearner, OptionTD3
+
+NET_ARCH = [128, 128]  # of the walker's networks
+#: Weight, in the loss of ``OptionDDPG``'s and ``OptionTD3``'s actors, of the mean squared norm of what their tanh is given:
+#: keeps them from getting stuck at the bounds of the actions (success on Medium 0.96 with it, 0.61 without).
+SATURATION_PENALTY = 1e-4
+#: Environment steps within which a goal is to be reached, where the environment names no time limit.
+HORIZON = 1_000
+OPTION_CLASSES: dict[str, type[OffPolicyAlgorithm]] = {cls.__name__: cls for cls in (OptionDDPG, OptionTD3, DDPG, TD3, SAC)}
+
+
+def option_class(given: type[OffPolicyAlgorithm] | str) -> type[OffPolicyAlgorithm]:
+    """Return a class of options' policies, which may be given by name.
+
+    :raises ValueError: if it is none
+    """
+    if isinstance(given, str) and given in OPTION_CLASSES:
+        return OPTION_CLASSES[given]
+    if isinstance(given, type) and issubclass(given, OffPolicyAlgorithm):
+        return given
+    raise ValueError(f"option_class is {given!r}: it must be an SB3 off-policy class, or one of {', '.join(OPTION_CLASSES)}.")
+
+
+_RANGES: dict[str, tuple[float, float]] = {
+    "tau": (0, 1),
+    "gamma": (0, 1),
+    "action_noise": (0, 1e6),
+    "explore_beyond": (0, 1e6),
+    "random_action_prob": (0, 1),
+    "hindsight": (0, 1),
+    "goal_tolerance": (1e-6, 1),
+    "shaping": (0, 1e6),
+}
+_WHOLE: dict[str, tuple[int, int]] = {
+    "learning_starts": (0, 2**62),
+    "buffer_size": (1, 2**62),
+    "batch_size": (1, 2**62),
+    "gradient_steps": (-1, 2**62),
+    "stats_window_size": (1, 2**62),
+    "max_events": (8, 2**62),
+    "walk_steps": (1, 2**62),
+    "exploration_steps": (1, 2**62),
+}
+
+
+def check_numbers(arguments: dict[str, Any]) -> None:
+    """Refuse numbers out of range.
+
+    :param arguments: the agent's keyword arguments
+    :raises ValueError: naming the argument and its range
+    """
+    noise, train_freq = arguments["action_noise"], arguments["train_freq"]
+    given = {**arguments, "action_noise": noise if isinstance(noise, int | float | str) else 0.0}
+    for ranges, kinds, what in ((_RANGES, (int, float, np.number), "a number"), (_WHOLE, (int, np.integer), "a whole number")):
+        for name, (low, high) in ranges.items():
+            value = given[name]
+            if isinstance(value, bool) or not isinstance(value, kinds) or not low <= value <= high:
+                upper = f"to {high:g}" if high < 1e6 else "on"
+                raise ValueError(f"{name} must be {what} from {low:g} {upper}, not {value!r}.")
+    frequency = train_freq[0] if isinstance(train_freq, tuple) else train_freq
+    if isinstance(frequency, int) and frequency < 1:
+        raise ValueError(f"train_freq must be 1 at least, not {train_freq!r}.")
+
+
+def box(space: spaces.Space) -> spaces.Box:
+    """Return an action space, which has been seen to be a box.
+
+    :param space: the space
+    """
+    assert isinstance(space, spaces.Box)
+    return space
+
+
+def event_radius(given: float | None, env: VecEnv | None) -> float:
+    """Return the radius of events, in goal units.
+
+    :param given: the argument; None for what the environment tells
+    :param env: the environment
+    :raises ValueError: if nothing tells, or it is no positive number
+    """
+    radius: Any = given
+    if radius is None and env is not None:
+        radius = success_radius(lambda name: env_attribute(env, name))
+    if radius is None:
+        raise ValueError(
+            "event_radius is required: the environment has neither a success_radius nor a distance_threshold to take "
+            "it from. Give the distance, in goal units, within which a goal counts as reached."
+        )
+    if isinstance(radius, bool) or not isinstance(radius, int | float | np.number) or not 0 < radius < np.inf:
+        raise ValueError(f"event_radius must be a positive number, not {radius!r}.")
+    return float(radius)
+
+
+def horizon(env: VecEnv | None) -> int:
+    """Return an environment's time limit, by the names in use.
+
+    :param env: the environment
+    """
+    if env is not None:
+        for name in ("max_steps", "_max_episode_steps"):
+            limit = env_attribute(env, name)
+            if limit:
+                return int(limit)
+    return HORIZON
+
+
+def option_kwargs(agent: OffPolicyAlgorithm, arguments: dict[str, Any]) -> dict[str, Any]:
+    """Return the keyword arguments of the options' SB3 models.
+
+    :param agent: gives SB3's arguments
+    :param arguments: the agent's keyword arguments
+    :raises ValueError: if the learning rate is a schedule where none is taken
+    """
+    cls = option_class(arguments["option_class"])
+    kwargs: dict[str, Any] = dict(
+        gamma=agent.gamma, tau=agent.tau, policy_kwargs={"net_arch": NET_ARCH, **agent.policy_kwargs}
+    )
+    if issubclass(cls, OptionLearner):
+        if callable(agent.learning_rate):
+            raise ValueError(f"{cls.__name__} takes constant learning rates; for a schedule use option_class=TD3 or SAC.")
+        kwargs.update(actor_learning_rate=agent.learning_rate, critic_learning_rate=agent.learning_rate)
+        kwargs.update(saturation_penalty=SATURATION_PENALTY)
+    else:
+        kwargs.update(learning_rate=agent.learning_rate)
+    return {**kwargs, **(arguments["option_kwargs"] or {})}
+
+
+def find_salience(
+    arguments: dict[str, Any], graph: SkillGraph, store: TransitionStore, agent: OffPolicyAlgorithm, relearn: int = LEARN_EVERY
+) -> Salience:
+    """Return what proposes salient events.
+
+    :param arguments: the agent's keyword arguments
+    :param graph: the skill graph
+    :param store: the transitions
+    :param agent: gives the environment
+    :param relearn: transitions after which DCO learns another embedding
+    :raises ValueError: if there is no such thing
+    """
+    salience = arguments["salience"]
+    if salience == "frontier":
+        return FrontierSalience(graph)
+    if salience == "dco":
+        return DCOSalience(store, graph.walk_steps, relearn)
+    if salience == "rrt":
+        return RandomSalience(Oracle(agent.get_env))
+    if not hasattr(salience, "propose"):
+        raise ValueError(
+            f"Unknown salience {salience!r}: use 'frontier', 'rrt', 'dco' or an object with a method propose(rng) that "
+            "returns a point of goal space."
+        )
+    return salience
