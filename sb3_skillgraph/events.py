@@ -70,6 +70,11 @@ class Event:
         """
         return math.dist(point.tolist(), self._coordinates) <= self.radius  # type: ignore[attr-defined]
 
+    def as_vertex(self) -> dict[str, Any]:
+        """Return what its vertex carries in networkx, numbers and strings only."""
+        place = {f"x{k}": float(x) for k, x in enumerate(self.center)}
+        return {"kind": "event", "salient": self.salient, "radius": self.radius, **place}
+
     def get_state(self) -> dict[str, Any]:
         """Return the event as plain data."""
         return {"id": self.id, "center": self.center, "radius": self.radius, "salient": self.salient}

@@ -262,8 +262,7 @@ class SkillGraph:
 
         graph, edges = networkx.DiGraph(), self.edges
         for i, event in enumerate(self.events):
-            place = {f"x{k}": float(x) for k, x in enumerate(event.center)}
-            graph.add_node(event.id, kind="event", salient=event.salient, radius=event.radius, **place)
+            graph.add_node(event.id, **event.as_vertex())
             graph.add_node(self.walk_ids[i], kind="walk", target=event.id)
         columns = {name: getattr(edges, name).tolist() for name in _SHOWN}
         landed: dict[tuple[str, str], float] = {}

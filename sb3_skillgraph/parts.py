@@ -10,7 +10,7 @@ from sb3_skillgraph.arguments import box, check_numbers, event_radius, find_sali
 from sb3_skillgraph.edges import NOWHERE
 from sb3_skillgraph.goal_env import GoalSpec, find_view
 from sb3_skillgraph.graph import SkillGraph
-from sb3_skillgraph.learning.missions import Missions
+from sb3_skillgraph.learning.missions import Agenda, Missions
 from sb3_skillgraph.learning.rollout import Rollout
 from sb3_skillgraph.learning.witness import Witness
 from sb3_skillgraph.memory.store import TransitionStore
@@ -80,7 +80,7 @@ class Common(NamedTuple):
         )
         return cls(rng, view_name, view, store, factory, factory.make("walker", None, None), radius)
 
-    def rollout(self, runner: Runner, missions: Any, witness: Any, arguments: dict[str, Any]) -> Rollout:
+    def rollout(self, runner: Runner, missions: Agenda, witness: Any, arguments: dict[str, Any]) -> Rollout:
         """Build what learns from steps.
 
         :param runner: runs options
@@ -106,7 +106,7 @@ class Parts:
     model: WalkModel
     planner: Planner
     runner: Runner
-    missions: Missions
+    missions: Agenda
     witness: Witness
     rollout: Rollout
     skills: dict[str, Option]

@@ -1,6 +1,7 @@
 """What the agent is about while it learns: where to go, and to explore from there (sections 3.2.2, 3.2.4)."""
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -54,28 +55,19 @@ class Mission:
         return self.exploring and self.beyond is None
 
 
-class Missions:
-    """Chooses missions, and tells when they are over.
+class Agenda(ABC):
+    """What every environment's agent is about; how that is chosen, and when it is over, is for its subclasses to say.
 
     :param graph: the skill graph
     :param salience: proposes salient events
     :param exploration_steps: environment steps of an exploration
-    :param explore_beyond: event radii that an exploration towards a point goes on past it
     :param rng: random generator
     """
 
-    def __init__(
-        self,
-        graph: SkillGraph,
-        salience: Salience,
-        exploration_steps: int,
-        explore_beyond: float,
-        rng: np.random.Generator,
-    ) -> None:
+    def __init__(self, graph: SkillGraph, salience: Salience, exploration_steps: int, rng: np.random.Generator) -> None:
         self.graph = graph
         self.salience = salience
         self.exploration_steps = exploration_steps
-        self.explore_beyond = explore_beyond
         self.rng = rng
         self.pinned: np.ndarray | None = None  # the goal that adaptation is for
         self.current: list[Mission | None] = []
@@ -94,10 +86,10 @@ class Missions:
         mission = self.current[env]
         if mission is None:
             mission = self._random_walk(point) if warm_up else self._choose(point)
-            mission.clean = not mission.random_walk and bool(self.rng.random() < CLEAN)
             self.current[env] = mission
         return mission
 
+    @abstractmethod
     def observe(self, env: int, point: np.ndarray, run: Run | None, done: bool) -> bool:
         """Learn that a step was taken.
 
@@ -107,6 +99,56 @@ class Missions:
         :param done: whether the episode is over
         :return: whether the agent is to do something else now
         """
+
+    def discovered(self, env: int) -> None:  # noqa: B027
+        """The agent has come where it has never been."""
+
+    @abstractmethod
+    def _choose(self, point: np.ndarray) -> Mission: ...
+
+    def _random_walk(self, point: np.ndarray) -> Mission:
+        return Mission(point.astype(np.float64), explore_steps=self.exploration_steps, exploring=True)
+
+    def _is_at(self, point: np.ndarray, goal: np.ndarray) -> bool:
+        """Tell whether who stands at a point has reached a goal."""
+        return math.dist(point.tolist(), goal.tolist()) <= self.graph.radius
+
+    # -- saving -------------------------------------------------------------------------------------------------------
+
+    def get_state(self) -> dict[str, Any]:
+        """Return the missions as plain data."""
+        current = [None if mission is None else asdict(mission) for mission in self.current]
+        return {"current": current, "pinned": self.pinned}
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Restore what :meth:`get_state` returned."""
+        self.current = [None if spec is None else Mission(**spec) for spec in state["current"]]
+        self.pinned = state["pinned"]
+
+
+class Missions(Agenda):
+    """Chooses missions, and tells when they are over.
+
+    :param graph: the skill graph
+    :param salience: proposes salient events
+    :param exploration_steps: environment steps of an exploration
+    :param explore_beyond: event radii that an exploration towards a point goes on past it
+    :param rng: random generator
+    """
+
+    def __init__(
+        self,
+        graph: SkillGraph,
+        salience: Salience,
+        exploration_steps: int,
+        explore_beyond: float,
+        rng: np.random.Generator,
+    ) -> None:
+        super().__init__(graph, salience, exploration_steps, rng)
+        self.explore_beyond = explore_beyond
+
+    def observe(self, env: int, point: np.ndarray, run: Run | None, done: bool) -> bool:
+        """Learn that a step was taken: the mission may be over, or its exploration begin."""
         mission = self.current[env]
         assert mission is not None
         was_exploring = mission.exploring
@@ -137,13 +179,14 @@ class Missions:
         mission.exploring = arrived and mission.explore_steps > 0
         return arrived and not mission.exploring
 
-    def _is_at(self, point: np.ndarray, goal: np.ndarray) -> bool:
-        """Tell whether who stands at a point has reached a goal."""
-        return math.dist(point.tolist(), goal.tolist()) <= self.graph.radius
-
     # -- choosing -----------------------------------------------------------------------------------------------------
 
     def _choose(self, point: np.ndarray) -> Mission:
+        mission = self._pick(point)
+        mission.clean = not mission.random_walk and bool(self.rng.random() < CLEAN)
+        return mission
+
+    def _pick(self, point: np.ndarray) -> Mission:
         if self.pinned is not None:
             return self._adapt(point, self.pinned)
         if self.rng.random() < EXPLORE:
@@ -153,9 +196,6 @@ class Missions:
     def _travel(self) -> Mission:
         """Go to any event."""
         return Mission(self.graph.centers[self.rng.integers(len(self.graph.events))].copy())
-
-    def _random_walk(self, point: np.ndarray) -> Mission:
-        return Mission(point.astype(np.float64), explore_steps=self.exploration_steps, exploring=True)
 
     def _explore(self, point: np.ndarray) -> Mission:
         """Go to the event nearest to a proposed point, and on towards it or at random.
@@ -194,15 +234,3 @@ class Missions:
             points = self.rng.uniform(*box, (N_DRAWN, self.graph.goal_dim))
             place = next((point for point in points if self.graph.locate(point) == NOWHERE), goal)
         return self._beyond(int(self.graph.distances(place).argmin()), place)
-
-    # -- saving -------------------------------------------------------------------------------------------------------
-
-    def get_state(self) -> dict[str, Any]:
-        """Return the missions as plain data."""
-        current = [None if mission is None else asdict(mission) for mission in self.current]
-        return {"current": current, "pinned": self.pinned}
-
-    def set_state(self, state: dict[str, Any]) -> None:
-        """Restore what :meth:`get_state` returned."""
-        self.current = [None if spec is None else Mission(**spec) for spec in state["current"]]
-        self.pinned = state["pinned"]

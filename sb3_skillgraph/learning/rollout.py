@@ -6,7 +6,7 @@ import numpy as np
 from stable_baselines3.common.noise import ActionNoise
 
 from sb3_skillgraph.choices import OPTIMISTIC
-from sb3_skillgraph.learning.missions import Mission, Missions
+from sb3_skillgraph.learning.missions import Agenda, Mission
 from sb3_skillgraph.learning.witness import Witness
 from sb3_skillgraph.memory.store import TransitionStore
 from sb3_skillgraph.planning import DIRECT
@@ -42,7 +42,7 @@ class Rollout:
     def __init__(
         self,
         runner: Runner,
-        missions: Missions,
+        missions: Agenda,
         witness: Witness,
         store: TransitionStore,
         noise_std: float,

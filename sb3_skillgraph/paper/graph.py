@@ -63,8 +63,7 @@ class PaperGraph(SkillGraph):
         """
         i = super().add_event(center, salient=True)
         event = self.events[i]
-        place = {f"x{k}": float(x) for k, x in enumerate(event.center)}
-        self._digraph.add_node(event.id, kind="event", salient=True, radius=self.radius, **place)
+        self._digraph.add_node(event.id, **event.as_vertex())
         self.triggers[event.id] = deque([event.center], maxlen=TRIGGERS_LENGTH)
         for option in self.options.values():
             self._event_option_edge(event.id, option)

@@ -1,22 +1,23 @@
 """What the agent is about while it learns, by the paper: events found, targets picked (sections 3.2.1, 3.2.2, A.1, A.3)."""
 
 import math
-from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 
 from sb3_skillgraph.edges import NOWHERE
 from sb3_skillgraph.events import Event
-from sb3_skillgraph.learning.missions import Mission
+from sb3_skillgraph.learning.missions import Agenda, Mission
 from sb3_skillgraph.learning.salience import Salience
 from sb3_skillgraph.paper.chaining import DeepSkillChaining
 from sb3_skillgraph.paper.graph import PaperGraph
 from sb3_skillgraph.rules import PaperRules
 from sb3_skillgraph.runner import Run
 
+_COUNTERS = ("n_episodes", "last_accepted", "last_rejected", "newest")
 
-class PaperMissions:
+
+class PaperMissions(Agenda):
     """Finds salient events, and picks one of all of them as the target, each as likely.
 
     :param graph: the skill graph
@@ -36,50 +37,21 @@ class PaperMissions:
         exploration_steps: int,
         rng: np.random.Generator,
     ) -> None:
-        self.graph = graph
+        super().__init__(graph, salience, exploration_steps, rng)
+        self.graph: PaperGraph = graph
         self.chaining = chaining
-        self.salience = salience
         self.rules = rules
-        self.exploration_steps = exploration_steps
-        self.rng = rng
-        self.pinned: np.ndarray | None = None  # the goal that adaptation is for
-        self.current: list[Mission | None] = []
         self.n_episodes = 0
         self.last_accepted = 0  # episode
         self.last_rejected: int | None = None  # episode, if nothing was accepted at the last attempt
         self.newest = ""  # id of the event accepted last
 
-    def cut(self, n_envs: int) -> None:
-        """Forget what the environments were in the middle of."""
-        self.current = [None] * n_envs
-
-    def of(self, env: int, point: np.ndarray, warm_up: bool) -> Mission:
-        """Return an environment's mission; a new one where the last is over.
-
-        :param env: which environment
-        :param point: where the agent stands, shape ``(goal_dim,)``
-        :param warm_up: whether to walk at random, whatever there is to do
-        """
-        mission = self.current[env]
-        if mission is None:
-            mission = self._random_walk(point) if warm_up else self._choose(point)
-            self.current[env] = mission
-        return mission
-
     def observe(self, env: int, point: np.ndarray, run: Run | None, done: bool) -> bool:
-        """Learn that a step was taken.
-
-        :param env: which environment
-        :param point: where the agent has got to, shape ``(goal_dim,)``
-        :param run: not used
-        :param done: whether the episode is over
-        :return: whether the agent is to do something else now
-        """
+        """Learn that a step was taken; a target that is reached is followed by another (section 3.2.2)."""
         mission = self.current[env]
         assert mission is not None
         mission.explore_steps -= mission.exploring
-        near = math.dist(point.tolist(), mission.goal.tolist()) <= self.graph.radius
-        over = done or (mission.explore_steps <= 0 if mission.exploring else near)
+        over = done or (mission.explore_steps <= 0 if mission.exploring else self._is_at(point, mission.goal))
         self.n_episodes += done
         if over:
             self.current[env] = None
@@ -97,9 +69,6 @@ class PaperMissions:
             # The way there is known: the way back is learned (A.3).
             self.chaining.open_chain(self._event(chain.target), self._event(chain.source), back=True)
 
-    def discovered(self, env: int) -> None:
-        """Nothing follows from it."""
-
     # -- choosing -----------------------------------------------------------------------------------------------------
 
     def _choose(self, point: np.ndarray) -> Mission:
@@ -110,9 +79,6 @@ class PaperMissions:
         if not events:
             return self._random_walk(point)
         return Mission(events[self.rng.integers(len(events))].center.copy())
-
-    def _random_walk(self, point: np.ndarray) -> Mission:
-        return Mission(point.astype(np.float64), explore_steps=self.exploration_steps, exploring=True)
 
     def _event(self, id: str) -> Event:
         return self.graph.events[self.graph.index(id)]
@@ -170,12 +136,10 @@ class PaperMissions:
 
     def get_state(self) -> dict[str, Any]:
         """Return missions and counters as plain data."""
-        names = ("pinned", "n_episodes", "last_accepted", "last_rejected", "newest")
-        current = [None if mission is None else asdict(mission) for mission in self.current]
-        return {"current": current, **{name: getattr(self, name) for name in names}}
+        return {**super().get_state(), **{name: getattr(self, name) for name in _COUNTERS}}
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Restore what :meth:`get_state` returned."""
-        for name in ("pinned", "n_episodes", "last_accepted", "last_rejected", "newest"):
+        super().set_state(state)
+        for name in _COUNTERS:
             setattr(self, name, state[name])
-        self.current = [None if spec is None else Mission(**spec) for spec in state["current"]]

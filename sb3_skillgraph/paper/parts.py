@@ -7,6 +7,7 @@ import numpy as np
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_skillgraph.arguments import find_salience, horizon
+from sb3_skillgraph.edges import NOWHERE
 from sb3_skillgraph.goal_env import GoalSpec
 from sb3_skillgraph.options.option import Option
 from sb3_skillgraph.paper.chaining import DeepSkillChaining
@@ -50,7 +51,7 @@ class PaperParts(Parts):
         policy = PaperPolicy(graph, chaining, rules.timeout, planner.horizon)
         runner = Runner(graph, planner, walker.actor, view, chaining.options, policy)
         salience = find_salience(arguments, graph, store, agent, relearn=1)
-        missions: Any = PaperMissions(graph, chaining, salience, rules, arguments["exploration_steps"], rng)
+        missions = PaperMissions(graph, chaining, salience, rules, arguments["exploration_steps"], rng)
         witness: Any = PaperWitness(graph, chaining, missions, agent.n_envs)
         rollout = common.rollout(runner, missions, witness, arguments)
         known = (rng, view_name, factory, store, walker, graph, model, planner, runner, missions, witness, rollout)
@@ -96,7 +97,7 @@ class PaperParts(Parts):
         for spec in state["options"]:  # an option's parent was made before it
             record = spec["record"]
             event = graph.index(record["target"])
-            termination = graph.events[event] if event >= 0 else options[record["target"]]
+            termination = graph.events[event] if event != NOWHERE else options[record["target"]]
             option = self.factory.make(record["id"], record["target"], termination)
             set_skill_state(option, spec, self.factory.device)
             options[option.id] = option
