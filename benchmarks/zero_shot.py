@@ -53,7 +53,8 @@ def run_seed(args: argparse.Namespace, seed: int) -> dict[str, Any]:
     if agent.rules is not None:
         return {"seed": seed, "checks": checks}  # its walker does not learn
     straight = evaluate_pairs(StraightOn(agent), args.env, env_kwargs=args.env_kwargs, n_pairs=args.pairs, seed=seed + 1000)
-    return {"seed": seed, "checks": checks, "straight_on": straight.success_rate}
+    pairs = [[int(pair.success), pair.steps] for pair in straight.pairs]
+    return {"seed": seed, "checks": checks, "straight_on": {"success_rate": straight.success_rate, "pairs": pairs}}
 
 
 def described(result: PairsResult) -> dict[str, Any]:
@@ -68,6 +69,13 @@ def described(result: PairsResult) -> dict[str, Any]:
         "fell": sum(pair.stuck for pair in result.pairs),
         "pairs": [[int(pair.success), pair.steps, round(pair.trace.promised, 3)] for pair in result.pairs if pair.trace],
     }
+
+
+def steps_over_straight_on(run: dict[str, Any]) -> float:
+    """Return the steps of the trained agent over those of the walker sent straight on, over the pairs that both reached."""
+    both = [(a[1], b[1]) for a, b in zip(run["checks"][-1]["pairs"], run["straight_on"]["pairs"], strict=True) if a[0] and b[0]]
+    steps, straight = np.sum(both, axis=0) if both else (np.nan, np.nan)
+    return float(steps / straight)
 
 
 def promises(runs: list[dict[str, Any]]) -> dict[str, Any]:
@@ -116,7 +124,8 @@ def main() -> None:
             "runs": runs,
         }
         if "straight_on" in run:
-            document["straight_on"] = summary([r["straight_on"] for r in runs])
+            document["straight_on"] = summary([r["straight_on"]["success_rate"] for r in runs])
+            document["steps_over_straight_on"] = round(float(np.mean([steps_over_straight_on(r) for r in runs])), 3)
         args.out.parent.mkdir(parents=True, exist_ok=True)
         args.out.write_text(json.dumps(document) + "\n")
     print(json.dumps({name: value for name, value in document.items() if name != "runs"}, indent=1))
