@@ -1,7 +1,7 @@
 """The agent: an SB3 off-policy algorithm that explores, learns to walk, and plans over what it has learned (section 3)."""
 
 import copy
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any, ClassVar, Literal, TypeVar
 
 import numpy as np
@@ -23,6 +23,7 @@ from sb3_skillgraph.goal_env import GoalSpec, as_batch, as_goal, check_finite, r
 from sb3_skillgraph.interrupts import Interrupts
 from sb3_skillgraph.learning.episodes import Episodes
 from sb3_skillgraph.learning.salience import Salience
+from sb3_skillgraph.metric import Metric, MetricFunction
 from sb3_skillgraph.options.learner import OptionDDPG
 from sb3_skillgraph.options.option import Option
 from sb3_skillgraph.options.views import View
@@ -73,8 +74,10 @@ class SkillGraphAgent(OffPolicyAlgorithm):
         relative to where the agent stands), ``"egocentric"`` (without absolute position), ``"body"`` (from a robot's body),
         ``"placed_body"`` (and where that is) or a function; None takes the one the environment names in its attribute
         ``option_view``, else ``"relative"``
-    :param event_radius: radius of events, in goal units; None takes the environment's ``success_radius`` or
-        ``distance_threshold``
+    :param event_radius: how near to a goal is there: a radius in goal units, one for each dimension (infinite where it does
+        not matter), a :class:`~sb3_skillgraph.metric.Metric` for angles, rotations and what has to match, or a function
+        ``(a, b) -> distance`` in radii; None takes what the environment tells (``goal_metric``, ``success_radius``,
+        ``distance_threshold``)
     :param max_events: events that the graph may have; where more are needed they come to lie further apart
     :param walk_steps: environment steps within which a trajectory that goes from one event to another makes an edge
     :param salience: how events to pursue are proposed: ``"frontier"`` (uniform points around what has been visited),
@@ -116,7 +119,7 @@ class SkillGraphAgent(OffPolicyAlgorithm):
         option_class: type[OffPolicyAlgorithm] | str = OptionDDPG,
         option_kwargs: dict[str, Any] | None = None,
         option_view: str | View | None = None,
-        event_radius: float | None = None,
+        event_radius: float | Sequence[float] | Metric | MetricFunction | None = None,
         max_events: int = 500,
         walk_steps: int = 40,
         salience: Literal["frontier", "rrt", "dco"] | Salience = "frontier",
@@ -216,9 +219,14 @@ class SkillGraphAgent(OffPolicyAlgorithm):
         return self.parts.options()
 
     @property
+    def metric(self) -> Metric:
+        """How near to a goal, or to the centre of an event, is there: what was given as ``event_radius``."""
+        return self.graph.metric
+
+    @property
     def event_radius(self) -> float:
-        """Radius of the events, in goal units."""
-        return float(self.graph.radius)
+        """Radius of the events, in the metric's unit: goal units, unless a goal has several."""
+        return float(self.metric.radius)
 
     # -- learning -----------------------------------------------------------------------------------------------------
 

@@ -8,11 +8,12 @@ from stable_baselines3 import DDPG, SAC, TD3
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_skillgraph.goal_env import Oracle, env_attribute, success_radius
+from sb3_skillgraph.goal_env import Oracle, env_attribute, env_metric
 from sb3_skillgraph.graph import SkillGraph
 from sb3_skillgraph.learning.dco import LEARN_EVERY, DCOSalience
 from sb3_skillgraph.learning.salience import FrontierSalience, RandomSalience, Salience
 from sb3_skillgraph.memory.store import TransitionStore
+from sb3_skillgraph.metric import Metric, as_metric
 from sb3_skillgraph.options.learner import OptionDDPG, OptionLearner, OptionTD3
 
 NET_ARCH = [128, 128]  # of the walker's networks
@@ -86,24 +87,24 @@ def box(space: spaces.Space) -> spaces.Box:
     return space
 
 
-def event_radius(given: float | None, env: VecEnv | None) -> float:
-    """Return the radius of events, in goal units.
+def goal_metric(given: Any, env: VecEnv | None, goal_dim: int) -> Metric:
+    """Return when a goal counts as reached.
 
-    :param given: the argument; None for what the environment tells
+    :param given: the argument ``event_radius``; None for what the environment tells
     :param env: the environment
-    :raises ValueError: if nothing tells, or it is no positive number
+    :param goal_dim: length of a goal
+    :raises ValueError: if nothing tells, or it is no metric of such goals
     """
-    radius: Any = given
-    if radius is None and env is not None:
-        radius = success_radius(lambda name: env_attribute(env, name))
-    if radius is None:
+    metric = None if given is None else as_metric(given)
+    if metric is None and env is not None:
+        metric = env_metric(lambda name: env_attribute(env, name), goal_dim)
+    if metric is None:
         raise ValueError(
             "event_radius is required: the environment has neither a success_radius nor a distance_threshold to take "
             "it from. Give the distance, in goal units, within which a goal counts as reached."
         )
-    if isinstance(radius, bool) or not isinstance(radius, int | float | np.number) or not 0 < radius < np.inf:
-        raise ValueError(f"event_radius must be a positive number, not {radius!r}.")
-    return float(radius)
+    metric.check(goal_dim)
+    return metric
 
 
 def horizon(env: VecEnv | None) -> int:

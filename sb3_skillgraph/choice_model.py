@@ -47,8 +47,7 @@ class ChoiceModel:
     def kinds(self) -> Kind:
         """Return what is known of the graph's walks beside their runs."""
         graph, edges = self.graph, self.graph.edges
-        offsets = graph.centers[edges.target] - graph.centers[edges.source]
-        distance = np.linalg.norm(offsets, axis=1) / graph.radius
+        distance = graph.metric.travel(graph.centers[edges.target], graph.centers[edges.source])
         return Kind(distance, edges.crossing_steps, edges.forward, edges.backward)
 
     def _gather(self) -> Choices:
@@ -93,11 +92,10 @@ class ChoiceModel:
         """
         graph, edges = self.graph, self.graph.edges
         rows = np.flatnonzero(edges.failures > 0.0)
-        # With one entry more than there are events: NOWHERE is infinitely far away.
-        centers = np.concatenate([graph.centers, np.full((1, graph.goal_dim), np.inf)])
-        away = np.linalg.norm(centers[edges.landing[rows]] - graph.centers[edges.source[rows]][:, None], axis=2)
-        far = away > FAR * (kinds.distance[rows, None] + 1.0) * graph.radius
         result = np.zeros(edges.size)
+        landing = edges.landing[rows]
+        away = graph.metric.travel(graph.centers[landing], graph.centers[edges.source[rows]][:, None])
+        far = (landing == NOWHERE) | (away > FAR * (kinds.distance[rows, None] + 1.0))
         result[rows] = (edges.landing_weight[rows] * far).sum(axis=1) * graph.aging()[rows]
         return result
 
@@ -140,9 +138,9 @@ class ChoiceModel:
         graph is considered only where there is no shorter one.
         """
         graph, vertex = self.graph, len(self.graph.events)
-        distance = graph.distances(goal)
+        distance = graph.travel(goal)
         home = graph.locate(goal)
-        near = np.argsort(distance, kind="stable")
+        near = np.argsort(graph.distances(goal), kind="stable")
         if not everywhere:
             near = near[:NEAR_EVENTS]
         if home == NOWHERE:
@@ -170,11 +168,11 @@ class ChoiceModel:
 
         :param walks: to the event
         :param home: index of the event
-        :param distance: of all events from the goal, in goal units
+        :param distance: from all events to the goal, in radii
         :param runs: of the episode
         """
         vertex, centers = len(self.graph.events), self.graph.centers
-        between = np.maximum(np.linalg.norm(centers[walks.source] - centers[home], axis=1), 1e-9)
+        between = np.maximum(self.graph.metric.travel(centers[walks.source], centers[home]), 1e-9)
         stretch = np.clip(distance[walks.source] / between, 0.5, 2.0)
         beside = walks._replace(
             target=np.full(len(walks.target), vertex),
@@ -202,12 +200,12 @@ class ChoiceModel:
         :param source: vertices where they begin, shape ``(n,)``
         :param event: events that runs of them are recorded for
         :param target: vertices where they lead
-        :param distance: in goal units
+        :param distance: in radii
         :param seen: 1 where somebody has been near the target, 0 elsewhere
         :param runs: of the episode
         """
-        n, radii = len(source), distance / self.graph.radius
-        kind = Kind(radii, seen * self.model.steps_per_radius * radii, seen, np.zeros(n))
+        n = len(source)
+        kind = Kind(distance, seen * self.model.steps_per_radius * distance, seen, np.zeros(n))
         landing = np.full((n, self.graph.edges.landing.shape[1]), NOWHERE)
         targets = np.broadcast_to(np.asarray(target), (n,)).copy()
         zeros, steps = (np.zeros(n), np.zeros(n)), self.model.steps(kind)
@@ -232,27 +230,27 @@ class ChoiceModel:
     ) -> Choices:
         """Return what can be done at the start: what can be done in its event, and walks that can be tried."""
         graph, n_events = self.graph, len(self.graph.events)
-        here, distances = np.array([n_events + 1]), graph.distances(start.point)
+        here, distance = np.array([n_events + 1]), graph.travel(start.point)
         event = np.array([start.event])
         parts = []
         if start.event != NOWHERE:
             parts += [self._edges(graph.edges.source == start.event, replaced, tried)]
             parts += [to_goal.take(to_goal.source == start.event)]
-            if distances[start.event] > graph.radius:
+            if distance[start.event] > 1.0:
                 # At the edge of its event: to walk to the middle first may help.
-                parts.append(self._guessed(here, event, start.event, distances[event], np.ones(1), runs))
+                parts.append(self._guessed(here, event, start.event, distance[event], np.ones(1), runs))
         else:
-            near = np.argsort(distances, kind="stable")[:NEAR_EVENTS]
+            near = np.argsort(graph.distances(start.point), kind="stable")[:NEAR_EVENTS]
             nowhere = np.full(len(near), NOWHERE)
-            parts.append(self._guessed(near, nowhere, near, distances[near], np.zeros(len(near)), runs))
+            parts.append(self._guessed(near, nowhere, near, distance[near], np.zeros(len(near)), runs))
         targets = np.concatenate([part.target for part in parts])
         if n_events not in targets:
-            distance = np.array([np.linalg.norm(goal - start.point)])
-            direct = self._guessed(here, event, n_events, distance, np.zeros(1), runs)
+            away = np.atleast_1d(graph.metric.travel(goal, start.point))
+            direct = self._guessed(here, event, n_events, away, np.zeros(1), runs)
             # One that would be longer than any walk in the graph is begun only where there is nothing else to do.
             if direct.steps[0] <= graph.walk_steps or not len(targets) or start.towards == n_events:
                 parts.append(direct)
         if start.towards not in (NOWHERE, n_events) and start.towards not in targets:
-            parts.append(self._guessed(here, event, start.towards, distances[[start.towards]], np.ones(1), runs))
+            parts.append(self._guessed(here, event, start.towards, distance[[start.towards]], np.ones(1), runs))
         choices = Choices.join(parts)
         return choices._replace(source=np.full(len(choices.source), n_events + 1))

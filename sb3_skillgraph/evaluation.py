@@ -10,7 +10,7 @@ from gymnasium import spaces
 
 from sb3_skillgraph.agent import SkillGraphAgent
 from sb3_skillgraph.envs import MazeGeometry
-from sb3_skillgraph.goal_env import success_radius
+from sb3_skillgraph.goal_env import env_metric
 from sb3_skillgraph.planning import DIRECT
 
 
@@ -283,17 +283,18 @@ def _judge(agent: Predictor, env: gym.Env) -> Callable[[Any, dict[str, Any]], bo
     """Return what tells from an observation and an info whether the goal is reached."""
     if not isinstance(env.observation_space, spaces.Dict) or "desired_goal" not in env.observation_space.spaces:
         raise ValueError(f"Goals are reached in goal environments (Dict observations), and {env} is none.")
-    radius = success_radius(lambda name: env.get_wrapper_attr(name) if env.has_wrapper_attr(name) else None)
-    if radius is None:
-        radius = getattr(agent, "event_radius", None)
+    goal_dim = len(env.observation_space["desired_goal"].sample())
+    metric = env_metric(lambda name: env.get_wrapper_attr(name) if env.has_wrapper_attr(name) else None, goal_dim)
+    if metric is None:
+        metric = getattr(agent, "metric", None)
 
     def has_reached(observation: Any, info: dict[str, Any]) -> bool:
         for name in ("is_success", "success"):
             if name in info:
                 return bool(info[name])
-        if radius is None:
+        if metric is None:
             raise ValueError(f"{env} does not tell when a goal is reached: it has no radius, and says nothing in its info.")
-        return _distance(observation) <= radius
+        return metric.reached(observation["achieved_goal"], observation["desired_goal"])
 
     return has_reached
 

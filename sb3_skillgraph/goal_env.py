@@ -7,7 +7,8 @@ import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
-from sb3_skillgraph.options.views import BODY_NUMBERS, View, as_view, body_view, placed_body_view
+from sb3_skillgraph.metric import Metric, Product, Rotation, Within, as_metric
+from sb3_skillgraph.options.views import BODY_NUMBERS, View, as_view, body_view, egocentric_view, placed_body_view
 
 FLOAT32_MAX = float(np.finfo(np.float32).max)
 KEYS = ("observation", "achieved_goal", "desired_goal")
@@ -15,6 +16,8 @@ KEYS = ("observation", "achieved_goal", "desired_goal")
 
 #: Metres within which the goals of gymnasium-robotics' ``PointMaze_*`` and ``AntMaze_*`` count as reached.
 ROBOTICS_MAZE_RADIUS = 0.45
+#: Numbers of a pose: where it is, and a quaternion.
+POSE_DIM = 7
 
 
 class GoalSpec(NamedTuple):
@@ -159,28 +162,45 @@ def env_attribute(env: VecEnv, name: str) -> Any:
     return env.get_attr(name, indices=0)[0] if env.has_attr(name) else None
 
 
-def success_radius(get: Callable[[str], Any]) -> Any:
-    """Return within which distance an environment counts a goal as reached, by the names in use; None if it does not tell.
+def env_metric(get: Callable[[str], Any], goal_dim: int) -> Metric | None:
+    """Return when an environment counts a goal as reached, by the names in use; None if it does not tell.
 
     :param get: returns an attribute of the environment, None if it has none
+    :param goal_dim: length of a goal
+    :raises ValueError: if what it tells is no metric
     """
-    for name in ("success_radius", "distance_threshold"):
-        radius = get(name)
-        if radius is not None:
-            return radius
-    of_task = getattr(get("task"), "distance_threshold", None)  # as panda-gym has it
-    if of_task is not None:
-        return of_task
-    # gymnasium-robotics' mazes have a number in their code, and no name for it.
-    return ROBOTICS_MAZE_RADIUS if hasattr(get("maze"), "maze_size_scaling") else None
+    told = [
+        get("goal_metric"),
+        get("success_radius"),
+        get("distance_threshold"),
+        getattr(get("task"), "distance_threshold", None),  # panda-gym
+        # gymnasium-robotics' mazes have a number in their code, and no name for it.
+        ROBOTICS_MAZE_RADIUS if hasattr(get("maze"), "maze_size_scaling") else None,
+    ]
+    radius = next((value for value in told if value is not None), None)
+    turn = get("rotation_threshold")
+    if turn is not None and goal_dim == POSE_DIM and radius is not None:
+        return _pose_metric(get, radius, turn)
+    return None if radius is None else as_metric(radius)
 
 
-def find_view(view: str | View | None, env: VecEnv | None, spec: GoalSpec) -> tuple[str | None, View]:
+def _pose_metric(get: Callable[[str], Any], radius: float, turn: float) -> Metric:
+    """Return the metric of poses (x, y, z, quaternion) as gymnasium-robotics' hands have them."""
+    place, rotation = Within(range(3), radius), Rotation(range(3, POSE_DIM), turn)
+    if get("target_position") == "ignore":
+        return Product(rotation)
+    if get("target_rotation") == "ignore":
+        return Product(place)
+    return Product(place, rotation)
+
+
+def find_view(view: str | View | None, env: VecEnv | None, spec: GoalSpec, metric: Metric) -> tuple[str | None, View]:
     """Return what a policy is to see.
 
     :param view: name of a view, a function, or None for what the environment names (else ``"relative"``)
     :param env: the environment
     :param spec: the environment's lengths
+    :param metric: of goal space
     :return: the name (None for a function) and the function
     :raises ValueError: if there is no view of that name, or it cannot be one of that environment
     """
@@ -194,6 +214,11 @@ def find_view(view: str | View | None, env: VecEnv | None, spec: GoalSpec) -> tu
             f"joints, but actions have {spec.action_dim}: there must be something else in it, such as contact forces "
             "(gymnasium-robotics' ant leaves them out with include_cfrc_ext_in_observation=False). For a body with joints "
             "that no motor moves give a function."
+        )
+    if function is egocentric_view and len(metric.embed(np.zeros(spec.goal_dim))) != spec.goal_dim:
+        raise ValueError(
+            f"option_view 'egocentric' leaves the achieved goal out of the observation, but with event_radius={metric!r} "
+            "networks see other numbers of it: use 'relative' or a function."
         )
     return (None if callable(view) else view), function
 

@@ -6,6 +6,7 @@ import numpy as np
 
 from sb3_skillgraph.edges import NOWHERE, RECORD, Edges, land
 from sb3_skillgraph.events import Event
+from sb3_skillgraph.metric import Metric, as_metric
 
 if TYPE_CHECKING:
     import networkx
@@ -31,17 +32,17 @@ class SkillGraph:
     An event is the vertex ``e7``; the walk to it, an option that every agent has as soon as it has the event, is ``w7``.
 
     :param goal_dim: dimension of goal space
-    :param radius: radius of the events, in goal units
+    :param metric: how near is inside an event; a number is a radius, in goal units
     :param max_events: how many there may be; when there are more the cover grows coarser
     :param walk_steps: environment steps within which a trajectory that goes from one event to another makes an edge
     """
 
-    def __init__(self, goal_dim: int, radius: float, max_events: int, walk_steps: int = 40) -> None:
+    def __init__(self, goal_dim: int, metric: Metric | float, max_events: int, walk_steps: int = 40) -> None:
         self.goal_dim = goal_dim
-        self.radius = radius
+        self.metric = as_metric(metric)
         self.max_events = max_events
         self.walk_steps = walk_steps
-        self.cover_radius = SPACING * radius
+        self.cover_radius = SPACING * self.metric.radius
         self.events: list[Event] = []
         self.edges = Edges()
         self._now = 0.0
@@ -89,14 +90,17 @@ class SkillGraph:
         """
         if not self.events:
             return NOWHERE
-        offsets = self.centers - point
-        squared = np.einsum("ij,ij->i", offsets, offsets)
-        nearest = int(squared.argmin())
-        return nearest if squared[nearest] <= self.cover_radius**2 else NOWHERE
+        distances = self.distances(point)
+        nearest = int(distances.argmin())
+        return nearest if distances[nearest] <= self.cover_radius else NOWHERE
 
     def distances(self, point: np.ndarray) -> np.ndarray:
-        """Return how far the events are from a point, shape ``(n_events,)``, in goal units."""
-        return np.linalg.norm(self.centers - point, axis=1)
+        """Return how far the events are from a point, shape ``(n_events,)``, in the metric's unit."""
+        return self.metric.distance(self.centers, point)
+
+    def travel(self, point: np.ndarray) -> np.ndarray:
+        """Return how far it is to go from a point to the events, or back, shape ``(n_events,)``, in radii."""
+        return self.metric.travel(self.centers, point)
 
     def add_event(self, center: np.ndarray, *, salient: bool) -> int:
         """Add an event; whoever adds sees to it that there is room (see :meth:`coarsen`).
@@ -106,7 +110,7 @@ class SkillGraph:
         :return: its index
         """
         i = len(self.events)
-        event = Event(f"e{self.n_made}", np.array(center, dtype=np.float64), self.radius, salient)
+        event = Event(f"e{self.n_made}", np.array(center, dtype=np.float64), self.metric, salient)
         if i == len(self._centers):
             self._centers = np.concatenate([self._centers, np.zeros_like(self._centers)])
             self.visits = np.concatenate([self.visits, np.zeros_like(self.visits)])
@@ -127,12 +131,12 @@ class SkillGraph:
         order = sorted(range(len(self.events)), key=lambda i: (not self.events[i].salient, i))
         kept: list[int] = []
         for i in order:
-            near = np.linalg.norm(self._centers[kept] - self._centers[i], axis=1) < self.cover_radius
+            near = self.metric.distance(self._centers[kept], self._centers[i]) < self.cover_radius
             if not near.any():
                 kept.append(i)
         kept.sort()
         centers = self._centers[kept]
-        distances = np.linalg.norm(self.centers[:, None] - centers, axis=2)
+        distances = self.metric.distance(self.centers[:, None], centers)
         new_index = distances.argmin(axis=1)
         self._rename(kept, new_index)
         return new_index
@@ -314,7 +318,7 @@ class SkillGraph:
         """Restore what :meth:`get_state` returned."""
         self.events, self.walk_ids, self.edges = [], [], Edges()
         for spec in state["events"]:
-            self.events[self.add_event(spec["center"], salient=spec["salient"])] = Event(**spec)
+            self.events[self.add_event(spec["center"], salient=spec["salient"])] = Event(**spec, metric=self.metric)
         self.walk_ids = list(state["walks"])
         self._index = self._build_index()
         self.visits[: len(self.events)] = state["visits"]

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_skillgraph.arguments import box, check_numbers, event_radius, find_salience, horizon, option_class, option_kwargs
+from sb3_skillgraph.arguments import box, check_numbers, find_salience, goal_metric, horizon, option_class, option_kwargs
 from sb3_skillgraph.edges import NOWHERE
 from sb3_skillgraph.goal_env import GoalSpec, find_view
 from sb3_skillgraph.graph import SkillGraph
@@ -14,6 +14,7 @@ from sb3_skillgraph.learning.missions import Agenda, Missions
 from sb3_skillgraph.learning.rollout import Rollout
 from sb3_skillgraph.learning.witness import Witness
 from sb3_skillgraph.memory.store import TransitionStore
+from sb3_skillgraph.metric import Metric
 from sb3_skillgraph.options.factory import OptionFactory, copy_policy
 from sb3_skillgraph.options.option import Option
 from sb3_skillgraph.options.views import ScaledView
@@ -37,7 +38,7 @@ class Common(NamedTuple):
     :param store: the transitions
     :param factory: makes options
     :param walker: the option that walks to any goal
-    :param radius: of events, in goal units
+    :param metric: of goal space
     """
 
     rng: np.random.Generator
@@ -46,7 +47,7 @@ class Common(NamedTuple):
     store: TransitionStore
     factory: OptionFactory
     walker: Option
-    radius: float
+    metric: Metric
 
     @classmethod
     def build(
@@ -61,9 +62,9 @@ class Common(NamedTuple):
         """
         check_numbers(arguments)
         rng = np.random.default_rng(agent.seed)
-        radius = event_radius(arguments["event_radius"], agent.env)
-        view_name, function = find_view(arguments["option_view"], agent.env, spec)
-        view = ScaledView(function, radius)
+        metric = goal_metric(arguments["event_radius"], agent.env, spec.goal_dim)
+        view_name, function = find_view(arguments["option_view"], agent.env, spec, metric)
+        view = ScaledView(function, metric)
         store = TransitionStore(agent.buffer_size, spec.observation_dim, spec.goal_dim, spec.action_dim, agent.n_envs)
         factory = OptionFactory(
             option_class(arguments["option_class"]),
@@ -71,14 +72,14 @@ class Common(NamedTuple):
             store,
             view,
             box(agent.action_space),
-            radius,
-            arguments["goal_tolerance"] * radius,
+            metric,
+            arguments["goal_tolerance"],
             rng,
             {"hindsight": arguments["hindsight"], "horizon": HINDSIGHT_STEPS, **(replay or {})},
             agent.device,
             arguments["shaping"],
         )
-        return cls(rng, view_name, view, store, factory, factory.make("walker", None, None), radius)
+        return cls(rng, view_name, view, store, factory, factory.make("walker", None, None), metric)
 
     def rollout(self, runner: Runner, missions: Agenda, witness: Any, arguments: dict[str, Any]) -> Rollout:
         """Build what learns from steps.
@@ -120,8 +121,8 @@ class Parts:
         :param arguments: the agent's keyword arguments
         """
         common = Common.build(agent, spec, arguments)
-        rng, view_name, view, store, factory, walker, radius = common
-        graph = SkillGraph(spec.goal_dim, radius, arguments["max_events"], arguments["walk_steps"])
+        rng, view_name, view, store, factory, walker, metric = common
+        graph = SkillGraph(spec.goal_dim, metric, arguments["max_events"], arguments["walk_steps"])
         model = WalkModel()
         planner = Planner(graph, model, horizon(agent.env))
         skills: dict[str, Option] = {}

@@ -60,7 +60,7 @@ def _arguments(agent: Any) -> dict[str, Any]:
     arguments = dict(agent._arguments)
     for name in ("batch_size", "gradient_steps", "learning_starts", "verbose"):
         arguments[name] = getattr(agent, name)
-    arguments["event_radius"] = agent.event_radius
+    arguments["event_radius"] = agent.metric.get_state()
     if agent.rules is not None:
         arguments["rules"] = asdict(agent.rules)
     if agent.action_noise is not None:

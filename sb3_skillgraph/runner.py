@@ -1,6 +1,5 @@
 """Running options, one environment step at a time: the same in ``learn`` and in ``predict`` (sections 3.2.4, A.6)."""
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
@@ -207,7 +206,7 @@ class Runner:
         """Tell whether an option has reached its termination set."""
         if option in self.skills:
             return self.skills[option].terminates(point)
-        return math.dist(point.tolist(), aim.tolist()) <= self.graph.radius
+        return self.graph.metric.reached(point, aim)
 
     def _run(self, state: RunnerState, i: int, point: np.ndarray, arrived: bool, lost: bool) -> Run:
         option = str(state.option[i])

@@ -11,6 +11,7 @@ from hypothesis import HealthCheck, Phase, settings
 
 from sb3_skillgraph.events import TerminationSet
 from sb3_skillgraph.memory.store import TransitionStore
+from sb3_skillgraph.metric import Ball
 from sb3_skillgraph.options.factory import OptionFactory
 from sb3_skillgraph.options.initiation import Boundary
 from sb3_skillgraph.options.learner import OptionDDPG
@@ -41,7 +42,7 @@ def make_factory(
     *,
     view: View = relative_view,
     radius: float = 1.0,
-    tolerance: float | None = None,
+    tolerance: float = 1.0,
     seed: int = 0,
     **replay_kwargs: Any,
 ) -> OptionFactory:
@@ -49,10 +50,10 @@ def make_factory(
         OptionDDPG,
         TINY_NETS,
         store,
-        ScaledView(view, radius),
+        ScaledView(view, Ball(radius)),
         spaces.Box(-1.0, 1.0, (2,), np.float32),
-        radius,
-        radius if tolerance is None else tolerance,
+        Ball(radius),
+        tolerance,
         np.random.default_rng(seed),
         {"hindsight": 0.8, "shared": 0.5, "horizon": 50} | replay_kwargs,
         th.device("cpu"),
@@ -76,7 +77,7 @@ def make_option(
     id: str, target: str | None, termination: TerminationSet | None, *, start: tuple[Sequence[float], float] | None = None
 ) -> Option:
     """A real option; if a disc ``(center, radius)`` is given it is mature and starts there, most surely in its inner half."""
-    option = Option(id, target, termination, shared_learner(), 1.0)
+    option = Option(id, target, termination, shared_learner(), Ball(1.0))
     if start is not None:
         center, radius = start
         option.initiation.optimistic_boundaries = [disc(center, radius)]

@@ -17,7 +17,8 @@ FLOORS: dict[str, float] = {
     "interrupts": 0,
     "rules": 0,  # numbers
     "vec_env": 0,
-    "events": 0,
+    "metric": 0,
+    "events": 0.5,
     "saving": 0.5,  # writes the version
     "envs": 1,
     "memory": 2,

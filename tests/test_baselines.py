@@ -24,6 +24,7 @@ from sb3_skillgraph.baselines import (
     make_uvfa,
 )
 from sb3_skillgraph.baselines.covering_replay import TERMINATION_SHARE, LowEnd
+from sb3_skillgraph.metric import Ball
 from sb3_skillgraph.options.execution import Fate
 from sb3_skillgraph.options.learner import OptionTD3
 from sb3_skillgraph.options.option import goal_rule
@@ -83,7 +84,7 @@ class Sinks(gym.Wrapper):
 
 
 def test_a_baseline_is_paid_as_options_are_paid() -> None:
-    task = OptionTask(Sinks(toy()), goal_rule(0.45, gamma=0.9, shaping=2.0))
+    task = OptionTask(Sinks(toy()), goal_rule(Ball(0.45), gamma=0.9, shaping=2.0))
     goal = np.array([1.0, 1.0])
     before = task.reset(seed=0, options={"start": [-1.0, 1.0], "goal": goal})[0]["achieved_goal"]
     for n_steps in (1, 2, 3):

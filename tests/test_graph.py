@@ -63,7 +63,7 @@ def test_an_event_needs_a_finite_centre(center: list[Any]) -> None:
 
 @pytest.mark.parametrize("radius", [0.0, -1.0, np.nan])
 def test_an_event_needs_a_positive_radius(radius: float) -> None:
-    with pytest.raises(ValueError, match="positive radius"):
+    with pytest.raises(ValueError, match="positive number"):
         Event("e0", np.zeros(2), radius)
 
 

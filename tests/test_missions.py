@@ -239,7 +239,7 @@ def test_the_frontier_lies_in_the_box_around_what_was_visited_and_a_little_beyon
     graph, rng = line_graph(3), np.random.default_rng(0)
     salience = FrontierSalience(graph)
     points = np.array([salience.propose(rng) for _ in range(500)])
-    lower, upper = box_around(graph.centers, graph.radius)
+    lower, upper = box_around(graph.centers, graph.metric)
     assert lower.tolist() == [-MARGIN, -MARGIN]
     assert upper.tolist() == [8.0 + MARGIN, MARGIN]
     assert ((points >= lower) & (points <= upper)).all()

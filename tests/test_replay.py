@@ -14,6 +14,7 @@ from sb3_skillgraph.envs import ToyMazeEnv
 from sb3_skillgraph.events import Event
 from sb3_skillgraph.memory.replay import OptionReplay, OptionRule
 from sb3_skillgraph.memory.store import TransitionStore
+from sb3_skillgraph.metric import Ball
 from sb3_skillgraph.options.env import OptionEnv
 from sb3_skillgraph.options.option import goal_rule, termination_rule
 from sb3_skillgraph.options.views import ScaledView, relative_view
@@ -159,6 +160,7 @@ def test_state_of_another_shape_is_refused(other: TransitionStore, named: str) -
 # -- an option's view -------------------------------------------------------------------------------------------------
 
 RADIUS = 2.0
+BALL = Ball(RADIUS)
 EVENT = Event("e0", np.array([3.0, 3.0]), 3.0)
 OBSERVATION_DIM = 1
 
@@ -224,7 +226,7 @@ def check_relabelling(store: TransitionStore, samples: ReplayBufferSamples, *, n
         if imagined[i] or i >= n_ending_in_event:
             reached = np.linalg.norm(end - goals[i]) <= RADIUS
         else:
-            reached = np.linalg.norm(end - EVENT.center) <= EVENT.radius
+            reached = np.linalg.norm(end - EVENT.center) <= EVENT.metric.radius
         stuck = store.stuck(number)[0]
         assert samples.rewards[i, 0] == pytest.approx(-100.0 if stuck else 0.0 if reached else -1.0)
         assert samples.dones[i, 0] == float(reached or stuck or store.terminated(number)[0])
@@ -250,7 +252,7 @@ def soon_stuck(store: TransitionStore) -> list[int]:
 @pytest.mark.parametrize(("hindsight", "shared"), [(0.0, 0.0), (0.8, 0.0), (0.8, 0.5), (1.0, 0.0), (0.0, 1.0)])
 def test_reward_and_end_follow_the_rule(hindsight: float, shared: float) -> None:
     store = walked_store()
-    replay = make_replay(store, termination_rule(EVENT, RADIUS), hindsight=hindsight, shared=shared)
+    replay = make_replay(store, termination_rule(EVENT, BALL), hindsight=hindsight, shared=shared)
     replay.add_rows(np.arange(10, 50))
     imagined = check_relabelling(store, replay.sample(300), n_ending_in_event=300 - int(300 * shared))
     expected = shared + (1.0 - shared) * hindsight
@@ -259,7 +261,7 @@ def test_reward_and_end_follow_the_rule(hindsight: float, shared: float) -> None
 
 def test_the_global_options_rule_is_the_distance_to_its_goal() -> None:
     store = walked_store()
-    replay = make_replay(store, goal_rule(RADIUS), everything=True, hindsight=0.6)
+    replay = make_replay(store, goal_rule(BALL), everything=True, hindsight=0.6)
     samples = replay.sample(1500)
     imagined = check_relabelling(store, samples, n_ending_in_event=0)
     assert abs(imagined.mean() - 0.6) < 0.06
@@ -278,7 +280,7 @@ def test_no_goal_is_put_in_shortly_before_the_agent_gets_stuck(n_envs: int, doom
         last = np.full(n_envs, t % n_steps == n_steps - 1)
         point, pursued = number.repeat(2, 1), np.full((n_envs, 2), 1e4)
         store.add(number, point, number, point, number, pursued, last, last, last & (t < n_steps))
-    replay = make_replay(store, goal_rule(RADIUS), everything=True, hindsight=1.0, doomed_steps=doomed_steps)
+    replay = make_replay(store, goal_rule(BALL), everything=True, hindsight=1.0, doomed_steps=doomed_steps)
     samples = replay.sample(8000)
     kept = {int(row) for row, seen in zip(samples.actions[:, 0], samples.observations, strict=True) if seen[-1] == 1e4}
     assert kept == set(range(n_envs * (n_steps - min(doomed_steps, n_steps // 2)), n_envs * n_steps))
@@ -287,7 +289,7 @@ def test_no_goal_is_put_in_shortly_before_the_agent_gets_stuck(n_envs: int, doom
 def test_both_outcomes_occur_in_the_walks() -> None:
     """The relabelling tests above see successes, failures and ends of both kinds."""
     store = walked_store()
-    replay = make_replay(store, termination_rule(EVENT, RADIUS), hindsight=0.0, shared=0.0)
+    replay = make_replay(store, termination_rule(EVENT, BALL), hindsight=0.0, shared=0.0)
     replay.add_rows(np.arange(0, 120))
     samples = replay.sample(1500)
     reached, done = samples.rewards.numpy() == 0.0, samples.dones.numpy() == 1.0
@@ -300,29 +302,29 @@ def test_both_outcomes_occur_in_the_walks() -> None:
 def test_shaping_changes_a_return_by_where_it_begins_alone(ending: str, gamma: float) -> None:
     """Whatever way is taken: so no policy is better or worse for it."""
     goal, n = np.array([3.0, -1.0]), 12
-    plain, shaped = goal_rule(RADIUS, gamma), goal_rule(RADIUS, gamma, 2.0)
+    plain, shaped = goal_rule(BALL, gamma=gamma), goal_rule(BALL, gamma=gamma, shaping=2.0)
     for seed in range(3):
         points = np.concatenate([np.zeros((1, 2)), np.random.default_rng(seed).normal(size=(n, 2))])
         last = np.arange(n) == n - 1
         flags = (last & (ending == "reached"), last & (ending != "going on"), last & (ending == "stuck"))
         step = (*flags, points[:-1], points[1:], np.tile(goal, (n, 1)))
         extra = (gamma ** np.arange(n)) @ (shaped.reward(*step) - plain.reward(*step))
-        left = gamma**n * 2.0 * np.linalg.norm(points[-1] - goal) if ending == "going on" else 0.0
-        assert extra + left == pytest.approx(2.0 * np.linalg.norm(goal), rel=1e-4)
+        left = gamma**n * np.linalg.norm(points[-1] - goal) if ending == "going on" else 0.0
+        assert extra + left == pytest.approx(np.linalg.norm(goal), rel=1e-4)  # 2 for a radius of 2
 
 
 def test_getting_stuck_costs_what_standing_there_forever_would() -> None:
     points, yes = np.zeros((1, 2)), np.ones(1, dtype=bool)
     for gamma in (0.9, 0.99):
-        reward = goal_rule(RADIUS, gamma).reward(~yes, yes, yes, points, points, points + 5.0)
+        reward = goal_rule(BALL, gamma=gamma).reward(~yes, yes, yes, points, points, points + 5.0)
         assert reward == pytest.approx(-sum(gamma**t for t in range(10_000)), rel=1e-4)
-    assert np.isfinite(goal_rule(RADIUS, 1.0).reward(~yes, yes, yes, points, points, points)).all()
+    assert np.isfinite(goal_rule(BALL, gamma=1.0).reward(~yes, yes, yes, points, points, points)).all()
 
 
 @pytest.mark.parametrize("shared", [0.0, 0.25, 1.0])
 def test_a_share_of_every_batch_comes_from_the_whole_store(shared: float) -> None:
     store = walked_store(gets_stuck=False)
-    replay = make_replay(store, termination_rule(EVENT, RADIUS), hindsight=0.0, shared=shared)
+    replay = make_replay(store, termination_rule(EVENT, BALL), hindsight=0.0, shared=shared)
     replay.add_rows(np.array([3, 7, 11]))
     samples = replay.sample(200)
     own = samples.observations.numpy()[:, -1] == 1e4  # own rows keep their goal here, shared ones never do
@@ -334,7 +336,7 @@ def test_a_share_of_every_batch_comes_from_the_whole_store(shared: float) -> Non
 
 def test_without_rows_of_its_own_an_option_learns_from_the_whole_store_in_hindsight() -> None:
     store = walked_store()
-    replay = make_replay(store, termination_rule(EVENT, RADIUS), hindsight=0.0, shared=0.5)
+    replay = make_replay(store, termination_rule(EVENT, BALL), hindsight=0.0, shared=0.5)
     assert replay.size() == 0
     assert check_relabelling(store, replay.sample(100), n_ending_in_event=0).all()
 
@@ -343,7 +345,7 @@ def test_without_rows_of_its_own_an_option_learns_from_the_whole_store_in_hindsi
 @profile(30)
 def test_a_view_never_reads_an_overwritten_row(turns: list[int], everything: bool) -> None:
     store = SpyStore(20, OBSERVATION_DIM, 2, 1, 1)
-    replay = make_replay(store, termination_rule(EVENT, RADIUS), everything=everything, capacity=10)
+    replay = make_replay(store, termination_rule(EVENT, BALL), everything=everything, capacity=10)
     for k, n in enumerate(turns):
         for _ in range(n):
             number = np.full((1, 1), store.total, dtype=np.float32)
@@ -361,7 +363,7 @@ def test_a_view_never_reads_an_overwritten_row(turns: list[int], everything: boo
 
 def test_only_the_newest_own_rows_are_kept() -> None:
     store = walked_store(n_steps=100)
-    replay = make_replay(store, termination_rule(EVENT, RADIUS), hindsight=0.0, shared=0.0, capacity=20)
+    replay = make_replay(store, termination_rule(EVENT, BALL), hindsight=0.0, shared=0.0, capacity=20)
     for row in range(0, 200, 2):
         replay.add_rows(np.array([row]))
     assert 10 <= replay.size() <= 20
@@ -371,9 +373,9 @@ def test_only_the_newest_own_rows_are_kept() -> None:
 
 def test_replay_state_round_trip() -> None:
     store = walked_store(capacity=60, n_steps=100)
-    replay = make_replay(store, termination_rule(EVENT, RADIUS))
+    replay = make_replay(store, termination_rule(EVENT, BALL))
     replay.add_rows(np.arange(100, 180))
-    restored = make_replay(store, termination_rule(EVENT, RADIUS))
+    restored = make_replay(store, termination_rule(EVENT, BALL))
     restored.set_state(copy.deepcopy(replay.get_state()))
     assert restored.size() == replay.size() == 40  # rows 140 to 179 can still be read
     for one, other in zip(replay.sample(64), restored.sample(64), strict=True):
@@ -405,7 +407,7 @@ def test_option_env_and_view_agree_on_the_same_transitions() -> None:
     rewards = [reward for _, _, reward, _ in stepped]
     assert {0.0, -1.0} == set(rewards)
     assert any(terminated and reward == -1.0 for _, _, reward, terminated in stepped)  # the environment ended it
-    factory = make_factory(store, radius=event.radius, hindsight=0.0, shared=0.0)
+    factory = make_factory(store, radius=event.metric.radius, hindsight=0.0, shared=0.0)
     replay = factory.make("o1", event.id, event).replay
     assert isinstance(replay.view, ScaledView)
     assert replay.view.function is relative_view

@@ -20,6 +20,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from sb3_skillgraph import OptionsEnv, SkillGraphAgent, SMDPQLearning
 from sb3_skillgraph.events import Event
 from sb3_skillgraph.memory.store import TransitionStore
+from sb3_skillgraph.metric import Ball
 from sb3_skillgraph.options.option import Option
 from sb3_skillgraph.smdp import FlatPolicy, GraphPolicy
 
@@ -57,7 +58,7 @@ def options(walker: Option) -> list[Option]:
 def made(id: str, target: str | None, termination: Event | None, **kwargs: Any) -> Option:
     option = make_option(id, target, termination, **kwargs)
     own = make_factory(TransitionStore(10, 2, 2, 2), radius=RADIUS).make(id, target, termination)
-    option.learner, option.radius = own.learner, RADIUS  # with a replay, whose view tells what it sees
+    option.learner, option.metric = own.learner, Ball(RADIUS)  # with a replay, whose view tells what it sees
     option._actor = Towards()  # type: ignore[assignment]
     return option
 

@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 
+from sb3_skillgraph.metric import Ball
 from sb3_skillgraph.options.views import VIEWS, ScaledView, View, body_view, egocentric_view, placed_body_view, relative_view
 
 
@@ -91,7 +92,7 @@ def test_body_view_refuses_what_is_no_such_body(observation_dim: int, goal_dim: 
 def test_scaled_view_measures_goal_space_in_units(name: str, unit: float) -> None:
     rest, achieved, goal = rows(6, 3, 0), rows(6, 2, 1), rows(6, 2, 2)
     observation = np.concatenate([achieved, rest], axis=1)
-    seen = ScaledView(VIEWS[name], unit)(observation, achieved, goal)
+    seen = ScaledView(VIEWS[name], Ball(unit))(observation, achieved, goal)
     assert seen.dtype == np.float32
     assert seen.flags.c_contiguous
     np.testing.assert_allclose(seen[:, -2:], (goal - achieved) / unit, rtol=1e-4, atol=1e-5)
@@ -102,11 +103,11 @@ def test_scaled_view_measures_goal_space_in_units(name: str, unit: float) -> Non
 
 @pytest.mark.parametrize("view", [relative_view, egocentric_view, lambda o, a, g: np.concatenate([o, o, g], axis=1)])
 def test_scaled_view_knows_its_length(view: View) -> None:
-    scaled = ScaledView(view, 0.5)
+    scaled = ScaledView(view, Ball(0.5))
     assert scaled.dim(6, 2) == scaled(rows(3, 6, 0), rows(3, 2, 1), rows(3, 2, 2)).shape[1]
 
 
 def test_scaled_view_is_float32_whatever_comes_in() -> None:
-    seen = ScaledView(relative_view, 2.0)(rows(2, 4, 0).astype(np.float64), np.ones((2, 2)), np.zeros((2, 2)))
+    seen = ScaledView(relative_view, Ball(2.0))(rows(2, 4, 0).astype(np.float64), np.ones((2, 2)), np.zeros((2, 2)))
     assert seen.dtype == np.float32
     np.testing.assert_allclose(seen[:, -2:], -0.5)

@@ -19,6 +19,7 @@ from sb3_skillgraph.baselines.goal_conditioned import GoalSchedule
 from sb3_skillgraph.goal_env import GoalSpec
 from sb3_skillgraph.learning.dco import learn_fiedler
 from sb3_skillgraph.memory.store import TransitionStore, as_rows
+from sb3_skillgraph.metric import Ball
 from sb3_skillgraph.options.factory import OptionFactory, copy_policy
 from sb3_skillgraph.options.learner import OptionDDPG, OptionTD3
 from sb3_skillgraph.options.option import Option
@@ -91,8 +92,8 @@ class CoveringOptions:
         self.options: list[Option] = []
         spec = GoalSpec.of(env.observation_space, env.action_space)
         self.store = TransitionStore(1_000_000, spec.observation_dim, spec.goal_dim, spec.action_dim)
-        radius = float(env.get_wrapper_attr("success_radius"))
-        view = ScaledView(as_view(env.get_wrapper_attr("option_view")), radius)
+        metric = Ball(env.get_wrapper_attr("success_radius"))
+        view = ScaledView(as_view(env.get_wrapper_attr("option_view")), metric)
         kwargs = dict(
             gamma=gamma,
             actor_learning_rate=1e-3,
@@ -101,7 +102,7 @@ class CoveringOptions:
             policy_kwargs={"net_arch": [128, 128]},
         )
         self._factory = OptionFactory(
-            option_class, kwargs, self.store, view, env.action_space, radius, radius, self.rng, {}, th.device("cpu"), shaping
+            option_class, kwargs, self.store, view, env.action_space, metric, 1.0, self.rng, {}, th.device("cpu"), shaping
         )
         self.global_option = self._factory.make("global", None, None) if spec.action_dim > MOST_AXES else None
         self.env = OptionsEnv(
@@ -248,7 +249,7 @@ class CoveringOptions:
             self.store, plain.view, plain.rule._replace(shaping=0.0), factory.observation_space, factory.action_space, self.rng
         )
         covering.end, covering.scale = end, scale
-        option.initiation = Everywhere(option.radius)
+        option.initiation = Everywhere(option.metric.radius)
         option.mature = True
         return option
 

@@ -8,6 +8,7 @@ from stable_baselines3 import DDPG, HerReplayBuffer
 from stable_baselines3.common.noise import NormalActionNoise
 
 from sb3_skillgraph.memory.replay import OptionRule
+from sb3_skillgraph.metric import Ball
 from sb3_skillgraph.options.option import goal_rule
 
 #: What the agent's own options learn with, for the sake of comparison; the discount is the paper's.
@@ -145,7 +146,7 @@ def make_her(env: gym.Env, *, seed: int | None = None, **kwargs: Any) -> DDPG:
     :param seed: of everything random
     :param kwargs: arguments of ``stable_baselines3.DDPG`` that differ from ``SETTINGS``
     """
-    rule = goal_rule(float(env.get_wrapper_attr("success_radius")))
+    rule = goal_rule(Ball(env.get_wrapper_attr("success_radius")))
     # HER samples complete episodes only, so that the first one must be over before learning starts.
     first_episode = int(env.get_wrapper_attr("max_steps")) if env.has_wrapper_attr("max_steps") else 1_000
     hindsight = dict(

@@ -1,6 +1,5 @@
 """What the agent is about while it learns: where to go, and to explore from there (sections 3.2.2, 3.2.4)."""
 
-import math
 from abc import ABC, abstractmethod
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -111,7 +110,7 @@ class Agenda(ABC):
 
     def _is_at(self, point: np.ndarray, goal: np.ndarray) -> bool:
         """Tell whether who stands at a point has reached a goal."""
-        return math.dist(point.tolist(), goal.tolist()) <= self.graph.radius
+        return self.graph.metric.reached(point, goal)
 
     # -- saving -------------------------------------------------------------------------------------------------------
 
@@ -214,9 +213,7 @@ class Missions(Agenda):
         goal = self.graph.centers[event].copy()
         if self.rng.random() >= TOWARDS:
             return Mission(goal, self.exploration_steps)
-        way = point - goal
-        further = self.explore_beyond * self.graph.radius / max(float(np.linalg.norm(way)), 1e-9)
-        return Mission(goal, self.exploration_steps, point + further * way)
+        return Mission(goal, self.exploration_steps, self.graph.metric.beyond(goal, point, self.explore_beyond))
 
     def _adapt(self, point: np.ndarray, goal: np.ndarray) -> Mission:
         """Pursue the goal that adaptation is for; look for a way to it while nobody has been there (section 3.3)."""
@@ -230,7 +227,7 @@ class Missions(Agenda):
         """Go to the event nearest to the goal, or to any other place that nobody knows, and on from there."""
         place = goal
         if self.rng.random() >= FROM_NEAREST:
-            box = box_around(np.concatenate([self.graph.centers, goal[None]]), self.graph.radius)
+            box = box_around(np.concatenate([self.graph.centers, goal[None]]), self.graph.metric)
             points = self.rng.uniform(*box, (N_DRAWN, self.graph.goal_dim))
             place = next((point for point in points if self.graph.locate(point) == NOWHERE), goal)
         return self._beyond(int(self.graph.distances(place).argmin()), place)

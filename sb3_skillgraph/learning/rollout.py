@@ -206,7 +206,7 @@ class Rollout:
     def _salient(self, point: np.ndarray) -> None:
         """A proposed point was reached: it becomes a vertex, where there is none."""
         graph = self.runner.graph
-        if graph.distances(point).min() > graph.radius:
+        if graph.distances(point).min() > graph.metric.radius:
             self.witness.add_event(point, salient=True)
 
     # -- saving -------------------------------------------------------------------------------------------------------

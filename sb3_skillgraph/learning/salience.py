@@ -6,6 +6,7 @@ from typing import Protocol
 import numpy as np
 
 from sb3_skillgraph.graph import SkillGraph
+from sb3_skillgraph.metric import Metric
 
 #: Event radii by which the box around everything visited is grown: what lies just outside is worth a look.
 MARGIN = 2.0
@@ -52,14 +53,15 @@ class FrontierSalience:
         """Propose a point in or near the box; None before anything was visited."""
         if not self.graph.events:
             return None
-        return rng.uniform(*box_around(self.graph.centers, self.graph.radius))
+        metric = self.graph.metric
+        return metric.nearest_goal(rng.uniform(*box_around(self.graph.centers, metric)))
 
 
-def box_around(points: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
+def box_around(points: np.ndarray, metric: Metric) -> tuple[np.ndarray, np.ndarray]:
     """Return the corners of a box that is a little larger than some points ask for, each of shape ``(goal_dim,)``.
 
     :param points: shape ``(n, goal_dim)``
-    :param radius: the event radius, in goal units
+    :param metric: of goal space
     """
-    margin = MARGIN * radius
+    margin = MARGIN * metric.reach(points.shape[1])
     return points.min(axis=0) - margin, points.max(axis=0) + margin

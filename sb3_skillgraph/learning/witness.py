@@ -123,7 +123,7 @@ class Witness:
             event = self.add_event(point, salient=False)
             is_new = self.graph.n_made > n_made
         stays, step = self._stays[env], self._step[env]
-        distance = float(np.linalg.norm(self.graph.centers[event] - point))
+        distance = float(self.graph.metric.distance(self.graph.centers[event], point))
         if stays and stays[-1].event == event:
             stays[-1].note(step, distance, (self.graph.walk_steps - 1) // 2)
             return is_new
@@ -191,7 +191,7 @@ class Witness:
                 graph.ran(source, target, run.success, graph.index(run.landing), run.steps)
             return
         if run.option == DIRECT:
-            distance = float(np.linalg.norm(run.aim - self._began[run.env])) / graph.radius
+            distance = float(graph.metric.travel(run.aim, self._began[run.env]))
             at_home = source != NOWHERE and graph.locate(run.aim) == source
             row = self._n_samples % N_SAMPLES
             self._samples[row] = distance, at_home, run.success, run.steps

@@ -11,6 +11,7 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_skillgraph.memory.store import TransitionStore
+from sb3_skillgraph.metric import Ball, Metric
 
 
 class OptionRule(NamedTuple):
@@ -23,13 +24,15 @@ class OptionRule(NamedTuple):
 
     :param reached: tells which transitions reach the goal
     :param gamma: discount factor
-    :param shaping: further reward for a goal unit of distance gained; it is the change of a potential (Ng et al., 1999),
+    :param shaping: further reward for a radius of distance gained; it is the change of a potential (Ng et al., 1999),
         which changes no policy's rank
+    :param metric: of that distance
     """
 
     reached: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
     gamma: float = 0.99
     shaping: float = 0.0
+    metric: Metric = Ball(1.0)
 
     def reward(
         self,
@@ -51,8 +54,8 @@ class OptionRule(NamedTuple):
         """
         reward = np.where(stuck, -1.0 / max(1.0 - self.gamma, 1e-3), np.where(reached, 0.0, -1.0))
         if self.shaping:
-            potential = self.gamma * np.linalg.norm(after - goal, axis=1) * ~over
-            reward += self.shaping * (np.linalg.norm(before - goal, axis=1) - potential)
+            potential = self.gamma * self.metric.travel(after, goal) * ~over
+            reward += self.shaping * (self.metric.travel(before, goal) - potential)
         return reward.astype(np.float32)
 
 

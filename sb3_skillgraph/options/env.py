@@ -62,8 +62,8 @@ class OptionEnv(gym.Wrapper):
             raise ValueError(f"The goal must have shape {space['achieved_goal'].shape}, not {self.goal.shape}.")
         if option_view is None and env.has_wrapper_attr("option_view"):
             option_view = env.get_wrapper_attr("option_view")
-        self.view = ScaledView(as_view(option_view), termination.radius)
-        self.rule = termination_rule(termination, termination.radius)
+        self.view = ScaledView(as_view(option_view), termination.metric)
+        self.rule = termination_rule(termination, termination.metric)
         dims = [int(np.prod(space[key].shape)) for key in ("observation", "achieved_goal")]  # type: ignore[arg-type]
         self.observation_space = spaces.Box(-np.inf, np.inf, (self.view.dim(*dims),), np.float32)
         self._last: dict[str, np.ndarray] | None = None

@@ -13,6 +13,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from sb3_skillgraph.events import TerminationSet
 from sb3_skillgraph.memory.replay import OptionReplay
 from sb3_skillgraph.memory.store import TransitionStore
+from sb3_skillgraph.metric import Metric
 from sb3_skillgraph.options.option import Option, goal_rule, termination_rule
 from sb3_skillgraph.options.views import ScaledView
 
@@ -40,7 +41,7 @@ class OptionFactory:
         store: TransitionStore,
         view: ScaledView,
         action_space: spaces.Box,
-        radius: float,
+        metric: Metric,
         tolerance: float,
         rng: np.random.Generator,
         replay_kwargs: dict[str, Any],
@@ -52,7 +53,7 @@ class OptionFactory:
         self.store = store
         self.view = view
         self.action_space = action_space
-        self.radius = radius
+        self.metric = metric
         self.tolerance = tolerance
         self.rng = rng
         self.replay_kwargs = replay_kwargs
@@ -76,11 +77,11 @@ class OptionFactory:
         :return: the option, gestating
         """
         everything = termination is None
-        pay = dict(gamma=self.option_kwargs.get("gamma", 0.99), shaping=self.shaping / self.radius)
+        pay = dict(gamma=self.option_kwargs.get("gamma", 0.99), shaping=self.shaping)
         if termination is None:
-            rule = goal_rule(self.tolerance, **pay)
+            rule = goal_rule(self.metric, self.tolerance, **pay)
         else:
-            rule = termination_rule(termination, self.tolerance, **pay)
+            rule = termination_rule(termination, self.metric, self.tolerance, **pay)
         replay = OptionReplay(
             self.store,
             self.view,
@@ -93,7 +94,7 @@ class OptionFactory:
             device=self.device,
             **self.replay_kwargs,
         )
-        option = Option(id, target, termination, self._learner(replay), self.radius)
+        option = Option(id, target, termination, self._learner(replay), self.metric)
         if termination is not None:
             replay.aim = lambda: option.subgoal
         return option

@@ -9,6 +9,7 @@ from stable_baselines3.common.policies import BasePolicy
 
 from sb3_skillgraph.events import TerminationSet
 from sb3_skillgraph.memory.replay import OptionReplay, OptionRule
+from sb3_skillgraph.metric import Metric
 from sb3_skillgraph.options.initiation import InitiationSet
 from sb3_skillgraph.options.numpy_actor import NumpyActor
 
@@ -29,7 +30,7 @@ class Option:
     :param target: id of the event or option it leads to; None for the global option
     :param termination: the set it ends in; None for the global option, which is given a goal each time
     :param learner: the SB3 model that holds its policy
-    :param radius: the event radius, in goal units
+    :param metric: of goal space
     """
 
     def __init__(
@@ -38,14 +39,14 @@ class Option:
         target: str | None,
         termination: TerminationSet | None,
         learner: OffPolicyAlgorithm,
-        radius: float,
+        metric: Metric,
     ) -> None:
         self.id = id
         self.target = target
         self.termination = termination
         self.learner = learner
-        self.radius = radius
-        self.initiation = InitiationSet(radius)
+        self.metric = metric
+        self.initiation = InitiationSet(metric.radius)
         self.mature = False
         self.n_successes = 0
         self.n_runs = 0
@@ -161,36 +162,39 @@ class Option:
         self.learner._n_updates = state["n_updates"]
 
 
-def goal_rule(radius: float, gamma: float = 0.99, shaping: float = 0.0) -> OptionRule:
-    """Return the rule of an option that is given its goal: it ends within ``radius`` of it.
+def goal_rule(metric: Metric, tolerance: float = 1.0, gamma: float = 0.99, shaping: float = 0.0) -> OptionRule:
+    """Return the rule of an option that is given its goal: it ends near it.
 
-    :param radius: distance in goal units
+    :param metric: of goal space
+    :param tolerance: how near, in radii
     :param gamma: see :class:`~sb3_skillgraph.memory.replay.OptionRule`
     :param shaping: likewise
     :return: the rule of the global option, and of every transition relabelled in hindsight
     """
 
     def reached(achieved_goal: np.ndarray, goal: np.ndarray, imagined: np.ndarray) -> np.ndarray:
-        offset = achieved_goal - goal
-        return np.einsum("ij,ij->i", offset, offset) <= radius**2
+        return metric.distance(achieved_goal, goal) <= tolerance * metric.radius
 
-    return OptionRule(reached, gamma, shaping)
+    return OptionRule(reached, gamma, shaping, metric)
 
 
-def termination_rule(termination: TerminationSet, radius: float, gamma: float = 0.99, shaping: float = 0.0) -> OptionRule:
+def termination_rule(
+    termination: TerminationSet, metric: Metric, tolerance: float = 1.0, gamma: float = 0.99, shaping: float = 0.0
+) -> OptionRule:
     """Return the rule of an option with a termination set of its own.
 
     :param termination: where the option ends
-    :param radius: radius of a goal put in by hindsight, in goal units
+    :param metric: of goal space
+    :param tolerance: how near a goal that was put in by hindsight counts as reached, in radii
     :param gamma: see :class:`~sb3_skillgraph.memory.replay.OptionRule`
     :param shaping: likewise
     :return: the rule
     """
-    near_goal = goal_rule(radius)
+    near_goal = goal_rule(metric, tolerance)
 
     def reached(achieved_goal: np.ndarray, goal: np.ndarray, imagined: np.ndarray) -> np.ndarray:
         hit = near_goal.reached(achieved_goal, goal, imagined)
         hit[~imagined] = termination.contains(achieved_goal[~imagined])
         return hit
 
-    return OptionRule(reached, gamma, shaping)
+    return OptionRule(reached, gamma, shaping, metric)

@@ -4,6 +4,8 @@ from collections.abc import Callable
 
 import numpy as np
 
+from sb3_skillgraph.metric import Metric
+
 View = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 BODY_NUMBERS = 11  # of what the body views take, beside two for each joint: height, quaternion, velocities
@@ -121,19 +123,19 @@ class ScaledView:
     """A view whose goal space is measured in event radii, so that networks see numbers of order one.
 
     Positions and offsets of 0.05 m (an arm) and of 4 m (an ant) then look alike to a policy. The function it wraps
-    still gets what it expects: ``achieved_goal`` and ``goal``, both divided by ``unit``.
+    still gets what it expects: ``achieved_goal`` and ``goal``, both as the metric shows them to networks.
 
     :param function: the view
-    :param unit: length of one unit, in goal units
+    :param metric: of goal space
     """
 
-    def __init__(self, function: View, unit: float) -> None:
+    def __init__(self, function: View, metric: Metric) -> None:
         self.function = function
-        self.unit = np.float32(unit)
+        self.metric = metric
 
     def __call__(self, observation: np.ndarray, achieved_goal: np.ndarray, goal: np.ndarray) -> np.ndarray:
         """Return what the policy sees, float32 of shape ``(n, dim)``."""
-        seen = self.function(observation, achieved_goal / self.unit, goal / self.unit)
+        seen = self.function(observation, self.metric.embed(achieved_goal), self.metric.embed(goal))
         return np.ascontiguousarray(seen, dtype=np.float32)
 
     def dim(self, observation_dim: int, goal_dim: int) -> int:

@@ -9,6 +9,7 @@ import numpy as np
 
 from sb3_skillgraph.events import Event
 from sb3_skillgraph.graph import SkillGraph
+from sb3_skillgraph.metric import Metric
 from sb3_skillgraph.options.option import Option
 
 #: Points kept of where an event was triggered.
@@ -34,13 +35,13 @@ class PaperGraph(SkillGraph):
     lies in no salient event belongs to none.
 
     :param goal_dim: dimension of goal space
-    :param radius: radius of the events, in goal units
+    :param metric: of goal space: how near is inside an event
     :param walk_steps: environment steps that the pairs of states lie apart at most from which DCO learns
     """
 
-    def __init__(self, goal_dim: int, radius: float, walk_steps: int = 40) -> None:
-        super().__init__(goal_dim, radius, max_events=2**31, walk_steps=walk_steps)
-        self.cover_radius = radius
+    def __init__(self, goal_dim: int, metric: Metric, walk_steps: int = 40) -> None:
+        super().__init__(goal_dim, metric, max_events=2**31, walk_steps=walk_steps)
+        self.cover_radius = metric.radius
         self.options: dict[str, Option] = {}
         self.triggers: dict[str, deque[np.ndarray]] = {}
         self._digraph = networkx.DiGraph()
@@ -172,7 +173,9 @@ class PaperGraph(SkillGraph):
         # The first trigger of an event is its centre, where nobody need have been.
         sets: dict[str, Any] = {id: points for id, points in self.triggers.items() if len(points) > 1}
         sets.update((option.id, option.effects) for option in self.options.values() if option.effects)
-        return [id for id, points in sets.items() if (np.linalg.norm(np.stack(points) - goal, axis=1) <= self.radius).all()]
+        return [
+            id for id, points in sets.items() if (self.metric.distance(np.stack(points), goal) <= self.metric.radius).all()
+        ]
 
     def joined(self) -> set[str]:
         """Return the ids of the events that are in the graph: the first one, and those that a path leads to from there."""

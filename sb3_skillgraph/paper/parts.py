@@ -9,6 +9,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from sb3_skillgraph.arguments import find_salience, horizon
 from sb3_skillgraph.edges import NOWHERE
 from sb3_skillgraph.goal_env import GoalSpec
+from sb3_skillgraph.metric import Ball
 from sb3_skillgraph.options.option import Option
 from sb3_skillgraph.paper.chaining import DeepSkillChaining
 from sb3_skillgraph.paper.graph import PaperGraph
@@ -42,9 +43,11 @@ class PaperParts(Parts):
         :param arguments: the agent's keyword arguments
         """
         common = Common.build(agent, spec, arguments, {"shared": 0.0})  # options learn from their own experience
-        rng, view_name, view, store, factory, walker, radius = common
+        rng, view_name, view, store, factory, walker, metric = common
+        if not isinstance(metric, Ball):
+            raise ValueError(f"With rules={arguments['rules']!r} events are balls: event_radius must be a number.")
         rules = arguments["rules"]
-        graph = PaperGraph(spec.goal_dim, radius, arguments["walk_steps"])
+        graph = PaperGraph(spec.goal_dim, metric, arguments["walk_steps"])
         chaining = DeepSkillChaining(graph, factory.make, rules.gestation_period)
         model = WalkModel()
         planner = Planner(graph, model, horizon(agent.env))  # never asked: the rules choose

@@ -9,6 +9,7 @@ from matplotlib.collections import PatchCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 
+from sb3_skillgraph.agent import SkillGraphAgent
 from sb3_skillgraph.envs import MazeGeometry
 
 # Colours that remain apart for the colour-blind; every figure means the same thing by them.
@@ -60,6 +61,14 @@ def draw_floor(axes: Axes, geometry: MazeGeometry | None, points: np.ndarray, ma
     note = "" if goal_dim <= 2 else f" (of {goal_dim} goal dimensions)"
     axes.set_xlabel("x" if geometry is not None else f"goal[0]{note}")
     axes.set_ylabel("y" if geometry is not None else f"goal[1]{note}")
+
+
+def disc_radius(agent: SkillGraphAgent) -> float:
+    """Return the radius of the discs that stand for goals and events in a picture, in goal units.
+
+    :param agent: whose events they are
+    """
+    return float(agent.metric.reach(agent.graph.goal_dim)[:2].max())
 
 
 def draw_disc(axes: Axes, center: np.ndarray, radius: float, **style: Any) -> Circle:

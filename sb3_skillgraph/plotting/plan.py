@@ -55,14 +55,14 @@ def run_plan(
     points = [np.array(observation["achieved_goal"], dtype=np.float64)]
     options: list[str] = []
     state: tuple[np.ndarray, ...] | None = None
-    reached = over = bool(np.linalg.norm(points[0] - target) <= agent.event_radius)
+    reached = over = agent.metric.reached(points[0], target)
     while not over:
         action, state = agent.predict(observation, state=state, deterministic=True)
         assert state is not None
         options += agent.running(state)
         observation, _, terminated, truncated, info = env.step(action)
         points.append(np.array(observation["achieved_goal"], dtype=np.float64))
-        reached = bool(np.linalg.norm(points[-1] - target) <= agent.event_radius)
+        reached = agent.metric.reached(points[-1], target)
         over = reached or terminated or truncated or bool(info.get("stuck"))
     return Trajectory(np.stack(points), options, target, reached), plan
 
@@ -85,12 +85,14 @@ def plot_plan(
     :return: the axes
     """
     axes = figures.new_axes() if ax is None else ax
-    figures.draw_floor(axes, geometry, np.vstack([trajectory.points, trajectory.goal]), 2 * agent.event_radius)
+    figures.draw_floor(axes, geometry, np.vstack([trajectory.points, trajectory.goal]), 2 * figures.disc_radius(agent))
     _draw_planned(axes, agent, trajectory, plan)
     _draw_runs(axes, agent, trajectory)
     start, goal = figures.project(np.stack([trajectory.points[0], trajectory.goal]))
     axes.plot(*start, "o", color=_START_COLOR, markersize=10, markeredgecolor="white", zorder=figures.Z_LABEL, label="start")
-    figures.draw_disc(axes, trajectory.goal, agent.event_radius, facecolor=_GOAL_COLOR, alpha=0.2, zorder=figures.Z_REGION)
+    figures.draw_disc(
+        axes, trajectory.goal, figures.disc_radius(agent), facecolor=_GOAL_COLOR, alpha=0.2, zorder=figures.Z_REGION
+    )
     axes.plot(*goal, "*", color=_GOAL_COLOR, markersize=15, markeredgecolor="white", zorder=figures.Z_LABEL, label="goal")
     happened = "reached" if trajectory.success else "missed"
     axes.set_title(
@@ -118,7 +120,7 @@ def _draw_planned(axes: Axes, agent: SkillGraphAgent, trajectory: Trajectory, pl
         figures.draw_disc(
             axes,
             event.center,
-            event.radius,
+            figures.disc_radius(agent),
             facecolor="none",
             edgecolor=_PLAN_COLOR,
             linewidth=0.7,

@@ -80,7 +80,7 @@ def plot_skill_graph(agent: SkillGraphAgent, geometry: MazeGeometry | None = Non
     """
     axes = figures.new_axes() if ax is None else ax
     centers = agent.graph.centers
-    figures.draw_floor(axes, geometry, centers if len(centers) else np.zeros((1, 2)), 2 * agent.event_radius)
+    figures.draw_floor(axes, geometry, centers if len(centers) else np.zeros((1, 2)), 2 * figures.disc_radius(agent))
     _draw_links(axes, agent, near_links(event_links(agent)))
     _draw_events(axes, agent)
     n_salient = sum(event.salient for event in agent.events)

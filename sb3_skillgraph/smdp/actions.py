@@ -1,6 +1,5 @@
 """What options do as actions of an SMDP: when they can be taken, and how they run."""
 
-import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple, Protocol
 
@@ -123,7 +122,7 @@ class OptionActions:
         """Tell whether it is where it leads, or at the goal."""
         point, option = np.asarray(observation["achieved_goal"]), run.option
         assert option is not None
-        reached = math.dist(point, run.aim) <= option.radius if option.target is None else option.terminates(point)
+        reached = option.metric.reached(point, run.aim) if option.target is None else option.terminates(point)
         return fate(reached, steps, int(run.timeout), stuck)
 
     def primitive(self) -> None:

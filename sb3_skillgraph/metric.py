@@ -1,0 +1,368 @@
+"""How far apart two goals are, and when one counts as reached: the unit of everything that lives in goal space."""
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+#: Radii by which goals are apart, beside all else, for every dimension that has to match and does not: no event is so large.
+MISMATCH = 1_000.0
+#: Values of a dimension that has to match are the same up to this difference: whole numbers are told apart.
+SAME = 0.5
+
+
+class Metric(ABC):
+    """A distance between goals; who is within ``radius`` of a goal has reached it.
+
+    Points are arrays of shape ``(..., goal_dim)``; leading axes are broadcast.
+    """
+
+    radius: float
+
+    @abstractmethod
+    def distance(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        """Return how far apart points are, shape ``(...)``."""
+
+    def travel(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        """Return how far one has to go from one point to another, in radii, shape ``(...)``: without what has to match."""
+        return self.distance(a, b) / self.radius
+
+    def reached(self, point: np.ndarray, goal: np.ndarray) -> bool:
+        """Tell whether who stands at a point, shape ``(goal_dim,)``, has reached a goal of the same shape."""
+        return bool(self.distance(point, goal) <= self.radius)
+
+    @abstractmethod
+    def embed(self, points: np.ndarray) -> np.ndarray:
+        """Return what networks see of points, float32 of shape ``(..., n)``: numbers in which a radius is about 1."""
+
+    @abstractmethod
+    def reach(self, goal_dim: int) -> np.ndarray:
+        """Return about how far off a goal may be in each dimension, shape ``(goal_dim,)``; 0 where that means nothing."""
+
+    def nearest_goal(self, point: np.ndarray) -> np.ndarray:
+        """Return what could be a goal instead of a point that was made up, same shape ``(goal_dim,)``."""
+        return point
+
+    def beyond(self, begin: np.ndarray, point: np.ndarray, radii: float) -> np.ndarray:
+        """Return a point on the way from one point to another and so many radii past it, shape ``(goal_dim,)``."""
+        length = max(float(self.travel(begin, point)), 1e-9)
+        return self.nearest_goal(np.where(self.reach(len(point)) > 0.0, point + radii / length * (point - begin), point))
+
+    def check(self, goal_dim: int) -> None:  # noqa: B027
+        """Refuse goals of another length.
+
+        :raises ValueError: if the metric is none of goals of that length
+        """
+
+    @abstractmethod
+    def get_state(self) -> Any:
+        """Return what :func:`as_metric` makes the metric of, as plain data."""
+
+
+@dataclass(frozen=True)
+class Ball(Metric):
+    """Euclidean distance, in the environment's goal units.
+
+    :param radius: within which a goal is reached
+    :raises ValueError: if it is no positive number
+    """
+
+    radius: float
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "radius", _positive(self.radius))
+
+    def __repr__(self) -> str:
+        return f"{self.radius:g}"
+
+    def distance(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        """Return the Euclidean distance, shape ``(...)``."""
+        return _length(a - b)
+
+    def reached(self, point: np.ndarray, goal: np.ndarray) -> bool:
+        """Tell whether a goal is reached: asked at every step, where arrays cost too much."""
+        return math.dist(point.tolist(), goal.tolist()) <= self.radius
+
+    def embed(self, points: np.ndarray) -> np.ndarray:
+        """Return points in radii."""
+        return points / np.float32(self.radius)
+
+    def reach(self, goal_dim: int) -> np.ndarray:
+        """Return the radius, for all dimensions."""
+        return np.full(goal_dim, self.radius)
+
+    def get_state(self) -> float:
+        """Return the radius."""
+        return self.radius
+
+
+# -- goals with several units ------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Part(ABC):
+    """Some dimensions of a goal that are measured together.
+
+    :param dims: which, counted from 0
+    """
+
+    dims: Sequence[int]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "dims", tuple(int(i) for i in self.dims))
+
+    @abstractmethod
+    def embed(self, points: np.ndarray) -> np.ndarray:
+        """Return coordinates between which the Euclidean distance is 1 for points that are a radius apart.
+
+        :param points: of these dimensions only, shape ``(..., len(dims))``
+        """
+
+    @property
+    @abstractmethod
+    def reach(self) -> float:
+        """About how far off a goal may be in each of these dimensions; 0 where that means nothing."""
+
+    def nearest_goal(self, point: np.ndarray) -> np.ndarray:
+        """Return what could be part of a goal, shape ``(len(dims),)``."""
+        return point
+
+
+@dataclass(frozen=True)
+class Within(Part):
+    """Positions and other numbers: Euclidean distance.
+
+    :param dims: which dimensions
+    :param radius: within which they have to be, together
+    """
+
+    radius: float
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        object.__setattr__(self, "radius", _positive(self.radius))
+
+    def embed(self, points: np.ndarray) -> np.ndarray:
+        """Return the numbers in radii."""
+        return points / self.radius
+
+    @property
+    def reach(self) -> float:
+        """The radius."""
+        return self.radius
+
+
+@dataclass(frozen=True)
+class Angle(Within):
+    """Angles, each the same after a whole turn.
+
+    :param dims: which dimensions
+    :param radius: within which each has to be, in radians
+    """
+
+    def embed(self, points: np.ndarray) -> np.ndarray:
+        """Return points of circles on which the radius is a chord of length 1."""
+        return np.concatenate([np.cos(points), np.sin(points)], axis=-1) / _chord(self.radius)
+
+    def nearest_goal(self, point: np.ndarray) -> np.ndarray:
+        """Return the angles between -pi and pi."""
+        return (point + np.pi) % (2.0 * np.pi) - np.pi
+
+
+@dataclass(frozen=True)
+class Rotation(Within):
+    """A rotation in space as a unit quaternion (w, x, y, z), the same as its negative.
+
+    :param dims: the four dimensions
+    :param radius: the angle, in radians, by which it may be off
+    """
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if len(self.dims) != 4:
+            raise ValueError(f"A rotation is a quaternion of 4 numbers, not of {len(self.dims)}.")
+
+    def embed(self, points: np.ndarray) -> np.ndarray:
+        """Return rotation matrices, shape ``(..., 9)``: the distance between two follows from the angle between them."""
+        length = np.maximum(_length(points)[..., None], 1e-9)
+        w, x, y, z = np.moveaxis(points / length, -1, 0)
+        rows = [
+            [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
+            [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
+            [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
+        ]
+        matrices = np.stack([entry for row in rows for entry in row], axis=-1)
+        return matrices / (np.sqrt(2.0) * _chord(self.radius))
+
+    @property
+    def reach(self) -> float:
+        """How much a number of the quaternion changes by a turn of the radius."""
+        return math.sin(0.5 * self.radius)
+
+    def nearest_goal(self, point: np.ndarray) -> np.ndarray:
+        """Return the quaternion of length 1."""
+        return point / max(float(np.linalg.norm(point)), 1e-9)
+
+
+@dataclass(frozen=True)
+class Exact(Part):
+    """Whole numbers, such as whether a key has been fetched: they match, or a goal is not reached.
+
+    :param dims: which dimensions
+    """
+
+    def embed(self, points: np.ndarray) -> np.ndarray:
+        """Return the numbers as they are."""
+        return points
+
+    @property
+    def reach(self) -> float:
+        """Nothing between two values is a goal."""
+        return 0.0
+
+    def nearest_goal(self, point: np.ndarray) -> np.ndarray:
+        """Return whole numbers."""
+        return np.round(point)
+
+
+class Product(Metric):
+    """A goal is reached where every part of it is: dimensions that belong to none do not matter.
+
+    The distance is that of the part that is furthest off, in its own radii; where something does not match that has to, goals
+    are far apart.
+
+    :param parts: the parts
+    :raises ValueError: if there are none that can be measured, or two have a dimension in common
+    """
+
+    radius = 1.0
+
+    def __init__(self, *parts: Part) -> None:
+        dims = [i for part in parts for i in part.dims]
+        if not any(isinstance(part, Within) for part in parts) or len(set(dims)) < len(dims) or min(dims) < 0:
+            raise ValueError(f"event_radius needs parts with a radius, and each dimension at most once, not {list(parts)}.")
+        self.parts = parts
+        self._measured = [part for part in parts if isinstance(part, Within)]
+        self._matched = [i for part in parts if isinstance(part, Exact) for i in part.dims]
+
+    def check(self, goal_dim: int) -> None:
+        """Refuse goals that have not all of the dimensions."""
+        last = max(i for part in self.parts for i in part.dims)
+        if last >= goal_dim:
+            raise ValueError(f"event_radius speaks of dimension {last} (counted from 0) of goals that have {goal_dim}.")
+
+    def get_state(self) -> Any:
+        """Return the parts."""
+        return {"parts": [{"kind": type(part).__name__, **vars(part)} for part in self.parts]}
+
+    def __repr__(self) -> str:
+        return f"Product({', '.join(map(repr, self.parts))})"
+
+    def distance(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        """Return the distance, in radii, shape ``(...)``."""
+        if not self._matched:
+            return self.travel(a, b)
+        apart = np.abs(np.asarray(a)[..., self._matched] - np.asarray(b)[..., self._matched]) > SAME
+        return self.travel(a, b) + MISMATCH * apart.sum(axis=-1)
+
+    def travel(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        """Return how far off the part is that is furthest off, shape ``(...)``."""
+        a, b = np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64)
+        dims = [list(part.dims) for part in self._measured]
+        away = [_length(part.embed(a[..., i]) - part.embed(b[..., i])) for part, i in zip(self._measured, dims, strict=True)]
+        return np.max(np.broadcast_arrays(*away), axis=0)
+
+    def embed(self, points: np.ndarray) -> np.ndarray:
+        """Return what all parts see, one after the other."""
+        seen = [part.embed(points[..., list(part.dims)]) for part in self.parts]
+        return np.concatenate(seen, axis=-1).astype(np.float32)
+
+    def reach(self, goal_dim: int) -> np.ndarray:
+        """Return the radii of the parts."""
+        result = np.zeros(goal_dim)
+        for part in self.parts:
+            result[list(part.dims)] = part.reach
+        return result
+
+    def nearest_goal(self, point: np.ndarray) -> np.ndarray:
+        """Return a point with whole angles, quaternions and values in place of those that were made up."""
+        point = np.array(point, dtype=np.float64)
+        for part in self.parts:
+            point[list(part.dims)] = part.nearest_goal(point[list(part.dims)])
+        return point
+
+
+class Custom(Metric):
+    """A user's own distance; it is saved by name only.
+
+    :param function: ``(a, b) -> distance`` of arrays of shape ``(..., goal_dim)``, 1 and less where a goal is reached
+    """
+
+    radius = 1.0
+
+    def __init__(self, function: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> None:
+        self.function = function
+
+    def __repr__(self) -> str:
+        return getattr(self.function, "__name__", repr(self.function))
+
+    def distance(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        """Return what the function returns, shape ``(...)``."""
+        return np.asarray(self.function(np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64)))
+
+    def embed(self, points: np.ndarray) -> np.ndarray:
+        """Return the points as they are."""
+        return points.astype(np.float32)
+
+    def reach(self, goal_dim: int) -> np.ndarray:
+        """Nothing is known of it."""
+        return np.ones(goal_dim)
+
+    def get_state(self) -> Any:
+        """Return the function."""
+        return self.function
+
+
+#: A user's own distance, in radii.
+MetricFunction = Callable[[np.ndarray, np.ndarray], np.ndarray]
+_PARTS = {part.__name__: part for part in (Within, Angle, Rotation, Exact)}
+
+
+def as_metric(given: Any) -> Metric:
+    """Return the metric that is meant.
+
+    :param given: a metric, or what one is made of: a radius; a radius for each dimension (infinite where it does not matter);
+        a function ``(a, b) -> distance`` in radii; or what ``get_state`` returned
+    :raises ValueError: if it is none of these
+    """
+    if isinstance(given, Metric):
+        return given
+    if callable(given):
+        return Custom(given)
+    if isinstance(given, dict) and given.get("parts"):
+        return Product(*(_part(**spec) for spec in given["parts"]))
+    if isinstance(given, list | tuple | np.ndarray) and np.ndim(given) == 1:
+        return Product(*(Within((i,), radius) for i, radius in enumerate(given) if radius != np.inf))
+    return Ball(given)
+
+
+def _part(kind: str, **arguments: Any) -> Part:
+    return _PARTS[kind](**arguments)
+
+
+def _positive(radius: Any) -> float:
+    if isinstance(radius, bool) or not isinstance(radius, int | float | np.number) or not 0 < radius < np.inf:
+        raise ValueError(f"event_radius must be a positive number, or a metric, not {radius!r}.")
+    return float(radius)
+
+
+def _length(vectors: np.ndarray) -> np.ndarray:
+    return np.sqrt(np.einsum("...i,...i->...", vectors, vectors))
+
+
+def _chord(angle: float) -> float:
+    """Return the distance between two points of a circle of radius 1 that are an angle apart (half a turn at most)."""
+    return 2.0 * math.sin(0.5 * min(angle, math.pi))

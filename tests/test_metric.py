@@ -1,0 +1,225 @@
+"""Metrics of goal space: what is near, what networks see, and that everything goes by them."""
+
+import io
+import math
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from builders import profile
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sb3_skillgraph import SkillGraphAgent
+from sb3_skillgraph.goal_env import env_metric
+from sb3_skillgraph.metric import MISMATCH, Angle, Ball, Custom, Exact, Metric, Product, Rotation, Within, as_metric
+
+TOY = "SkillGraph/ToyMaze-v0"
+MIXED = Product(Within((0, 1), 0.5), Angle((2,), 0.3), Exact((3,)))
+METRICS = [Ball(0.45), as_metric([0.5, 2.0, np.inf, 0.1]), MIXED, Product(Rotation((0, 1, 2, 3), 0.2))]
+
+
+def numbers(n: int) -> Any:
+    return st.lists(st.floats(-20.0, 20.0), min_size=n, max_size=n).map(np.array)
+
+
+@pytest.mark.parametrize("metric", METRICS, ids=repr)
+@profile(60)
+@given(a=numbers(4), b=numbers(4), c=numbers(4))
+def test_a_metric_is_one(metric: Metric, a: np.ndarray, b: np.ndarray, c: np.ndarray) -> None:
+    ab, ba, bc, ac = (float(metric.distance(*pair)) for pair in ((a, b), (b, a), (b, c), (a, c)))
+    assert metric.distance(a, a) == pytest.approx(0.0, abs=1e-6)
+    assert ab == pytest.approx(ba, abs=1e-9)
+    assert ac <= ab + bc + 1e-6
+    assert metric.reached(a, b) == (ab <= metric.radius)
+
+
+@pytest.mark.parametrize("metric", METRICS, ids=repr)
+def test_many_points_are_measured_as_one_by_one(metric: Metric) -> None:
+    rng = np.random.default_rng(0)
+    a, b = rng.normal(size=(5, 4)), rng.normal(size=(3, 4))
+    table = metric.distance(a[:, None], b)
+    assert table.shape == (5, 3)
+    np.testing.assert_allclose(table, [[metric.distance(x, y) for y in b] for x in a])
+    seen = metric.embed(a.astype(np.float32))
+    assert seen.dtype == np.float32
+    np.testing.assert_allclose(seen, [metric.embed(x.astype(np.float32)) for x in a], rtol=1e-6)
+
+
+@profile(60)
+@given(angle=st.floats(-10.0, 10.0), off=st.floats(-math.pi, math.pi), turns=st.integers(-3, 3))
+def test_an_angle_is_reached_within_its_radius_whatever_the_turns(angle: float, off: float, turns: int) -> None:
+    metric = Product(Angle((0,), 0.3))
+    reached = metric.reached(np.array([angle + off + 2.0 * math.pi * turns]), np.array([angle]))
+    if abs(abs(off) - 0.3) > 1e-6:
+        assert reached == (abs(off) < 0.3)
+
+
+@profile(60)
+@given(axis=numbers(3), angle=st.floats(0.0, math.pi), base=numbers(4), flip=st.booleans())
+def test_a_rotation_is_reached_within_its_angle_and_so_is_its_negative(
+    axis: np.ndarray, angle: float, base: np.ndarray, flip: bool
+) -> None:
+    if np.linalg.norm(axis) < 0.1 or np.linalg.norm(base) < 0.1:
+        return
+    base = base / np.linalg.norm(base)
+    turn = np.array([math.cos(angle / 2.0), *(math.sin(angle / 2.0) * axis / np.linalg.norm(axis))])
+    turned = quaternion_product(turn, base) * (-1.0 if flip else 1.0)
+    metric = Product(Rotation((0, 1, 2, 3), 0.2))
+    if abs(angle - 0.2) > 1e-5:
+        assert metric.reached(turned, base) == (angle < 0.2)
+
+
+def quaternion_product(p: np.ndarray, q: np.ndarray) -> np.ndarray:
+    w, v = p[0] * q[0] - p[1:] @ q[1:], p[0] * q[1:] + q[0] * p[1:] + np.cross(p[1:], q[1:])
+    return np.array([w, *v])
+
+
+def test_every_part_has_to_be_reached_and_what_belongs_to_none_does_not_matter() -> None:
+    goal = np.array([1.0, 2.0, 3.0, 1.0])
+    for off, reached in (
+        ([0.3, 0.39, 0.29, 0.0], True),
+        ([0.3, 0.41, 0.0, 0.0], False),  # 0.508 away
+        ([0.0, 0.0, 0.31, 0.0], False),
+        ([0.0, 0.0, 0.0, 1.0], False),
+        ([0.0, 0.0, 2.0 * math.pi, 0.4], True),
+    ):
+        assert MIXED.reached(goal + off, goal) == reached
+    loose = as_metric([0.5, np.inf, 0.1])
+    assert loose.reached(np.array([0.4, 99.0, 0.05]), np.zeros(3))
+    assert not loose.reached(np.array([0.4, 0.0, 0.15]), np.zeros(3))
+
+
+def test_what_has_to_match_keeps_goals_apart_but_is_no_way_to_go() -> None:
+    here, there = np.array([0.0, 0.0, 0.0, 0.0]), np.array([1.0, 0.0, 0.0, 1.0])
+    assert MIXED.travel(here, there) == pytest.approx(2.0)
+    assert MIXED.distance(here, there) == pytest.approx(2.0 + MISMATCH)
+
+
+def test_made_up_points_become_goals() -> None:
+    metric = Product(Within((0,), 0.5), Angle((1,), 0.3), Exact((2,)), Rotation((3, 4, 5, 6), 0.2))
+    goal = metric.nearest_goal(np.array([0.3, 4.0, 0.7, 2.0, 0.0, 0.0, 0.0]))
+    np.testing.assert_allclose(goal, [0.3, 4.0 - 2.0 * math.pi, 1.0, 1.0, 0.0, 0.0, 0.0])
+    begin, point = np.zeros(3), np.array([1.0, 0.2, 1.0])
+    beyond = Product(Within((0,), 0.5), Angle((1,), 0.3), Exact((2,))).beyond(begin, point, 4.0)
+    np.testing.assert_allclose(beyond, [3.0, 0.6, 1.0])  # two radii to the point, four more
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (0.0, "positive number"),
+        ("wide", "positive number"),
+        ([np.inf, np.inf], "at most once"),
+        ([0.3, np.nan], "positive number"),
+    ],
+)
+def test_what_is_no_metric(given: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        as_metric(given)
+
+
+def test_parts_that_do_not_fit() -> None:
+    with pytest.raises(ValueError, match="at most once"):
+        Product(Within((0, 1), 0.5), Exact((1,)))
+    with pytest.raises(ValueError, match="4 numbers"):
+        Rotation((0, 1, 2), 0.1)
+    with pytest.raises(ValueError, match="dimension 3"):
+        MIXED.check(3)
+
+
+# -- what an environment tells -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("id", ["HandManipulateBlock-v1", "HandManipulateBlockRotateXYZ-v1"])
+def test_poses_of_a_hand_are_reached_where_the_environment_says_so(id: str) -> None:
+    import gymnasium_robotics
+
+    gym.register_envs(gymnasium_robotics)
+    env = gym.make(id)
+    metric = env_metric(lambda name: getattr(env.unwrapped, name, None), 7)
+    assert isinstance(metric, Product)
+    rng, agreed, reached = np.random.default_rng(0), [], []
+    for _ in range(1_000):
+        goal = rng.normal(size=7)
+        goal[3:] /= np.linalg.norm(goal[3:])
+        axis = rng.normal(size=3)
+        angle = 0.1 * rng.uniform(0.9, 1.1)
+        turn = np.array([math.cos(angle / 2.0), *(math.sin(angle / 2.0) * axis / np.linalg.norm(axis))])
+        offset = rng.normal(size=3)
+        offset *= 0.01 * rng.uniform(0.9, 1.1) / np.linalg.norm(offset)
+        point = np.concatenate([goal[:3] + offset, quaternion_product(turn, goal[3:])])
+        theirs = bool(env.unwrapped._is_success(point, goal))  # type: ignore[attr-defined]
+        agreed.append(theirs == metric.reached(point, goal))
+        reached.append(theirs)
+    env.close()
+    assert all(agreed)
+    assert 200 < sum(reached) < 800
+
+
+# -- agents -----------------------------------------------------------------------------------------------------------
+
+
+class WithHeading(gym.ObservationWrapper):
+    """Goals get an angle, which the first action turns by, and a number that does not matter."""
+
+    def __init__(self, env: gym.Env) -> None:
+        super().__init__(env)
+        box = gym.spaces.Box(-np.inf, np.inf, (4,), np.float64)
+        self.observation_space = gym.spaces.Dict(
+            observation=env.observation_space["observation"], achieved_goal=box, desired_goal=box
+        )
+        self.heading, self.wanted, self.steps = 0.0, 0.0, 0
+
+    def reset(self, **kwargs: Any) -> Any:
+        observation, _ = self.env.reset(**kwargs)
+        self.heading, self.wanted = self.np_random.uniform(-np.pi, np.pi, 2)
+        return self.observation(observation), {}
+
+    def step(self, action: Any) -> Any:
+        self.heading = (self.heading + 0.3 * float(action[0]) + np.pi) % (2.0 * np.pi) - np.pi
+        observation, reward, terminated, truncated, _ = super().step(action)
+        return observation, reward, terminated, truncated, {}
+
+    def observation(self, observation: Any) -> Any:
+        self.steps += 1
+        achieved = np.array([*observation["achieved_goal"], self.heading, self.steps])
+        desired = np.array([*observation["desired_goal"], self.wanted, 0.0])
+        return {**observation, "achieved_goal": achieved, "desired_goal": desired}
+
+
+@pytest.mark.parametrize(
+    "metric",
+    [Product(Within((0, 1), 0.45), Angle((2,), 0.5)), [0.45, 0.45, 0.5, np.inf], lambda a, b: np.abs(a - b)[..., 0] / 0.4],
+    ids=["parts", "radii", "function"],
+)
+def test_an_agent_learns_saves_and_plans_with_any_metric(metric: Any) -> None:
+    env = WithHeading(gym.make(TOY))
+    nets = dict(policy_kwargs=dict(net_arch=[16, 16]), learning_starts=100, batch_size=16)
+    agent = SkillGraphAgent(
+        "MultiInputPolicy", env, event_radius=metric, option_view="relative", seed=0, max_events=60, **nets
+    )
+    agent.learn(600)
+    assert len(agent.events) > 1
+    centers = agent.graph.centers
+    apart = agent.metric.distance(centers[:, None], centers) + 10.0 * np.eye(len(centers))
+    assert apart.min() >= agent.metric.radius
+    file = io.BytesIO()
+    agent.save(file)
+    given = {"event_radius": metric} if callable(metric) else {}
+    if given:
+        with pytest.raises(ValueError, match=r"event_radius=.* again"):
+            SkillGraphAgent.load(io.BytesIO(file.getvalue()), env=env)
+    loaded = SkillGraphAgent.load(io.BytesIO(file.getvalue()), env=env, **given)
+    assert isinstance(loaded.metric, Custom if given else Product)
+    observation, _ = env.reset(seed=1)
+    assert loaded.plan(observation) == agent.plan(observation)
+    np.testing.assert_array_equal(loaded.predict(observation)[0], agent.predict(observation)[0])
+
+
+def test_the_paper_has_balls() -> None:
+    from sb3_skillgraph import PAPER
+
+    with pytest.raises(ValueError, match="must be a number"):
+        SkillGraphAgent("MultiInputPolicy", gym.make(TOY), event_radius=[0.45, 0.45], **PAPER)
