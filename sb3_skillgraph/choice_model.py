@@ -47,8 +47,9 @@ class ChoiceModel:
     def kinds(self) -> Kind:
         """Return what is known of the graph's walks beside their runs."""
         graph, edges = self.graph, self.graph.edges
-        distance = graph.metric.travel(graph.centers[edges.target], graph.centers[edges.source])
-        return Kind(distance, edges.crossing_steps, edges.forward, edges.backward)
+        ends = graph.centers[edges.target], graph.centers[edges.source]
+        distance, changes = graph.metric.travel(*ends), graph.metric.mismatches(*ends)
+        return Kind(distance, edges.crossing_steps, edges.forward, edges.backward, changes)
 
     def _gather(self) -> Choices:
         edges, aging, kinds = self.graph.edges, self.graph.aging(), self.kinds()
@@ -144,12 +145,12 @@ class ChoiceModel:
         if not everywhere:
             near = near[:NEAR_EVENTS]
         if home == NOWHERE:
-            guessed = self._guessed(near, near, vertex, distance[near], np.zeros(len(near)), runs)
+            guessed = self._guessed(near, near, vertex, graph.centers[near], goal, np.zeros(len(near)), runs)
             return guessed if everywhere else self._short(guessed, least=1)
         beside = self._beside(self._edges(graph.edges.target == home, replaced, tried), home, distance, runs)
         near = near[~np.isin(near, beside.source)]
         seen = (near == home).astype(np.float64)  # somebody was near the goal, in its event
-        guessed = self._guessed(near, near, vertex, distance[near], seen, runs)
+        guessed = self._guessed(near, near, vertex, graph.centers[near], goal, seen, runs)
         if not everywhere:
             guessed = self._short(guessed, least=0 if len(beside.source) else 1)
         return Choices.join([guessed, beside])
@@ -191,21 +192,24 @@ class ChoiceModel:
         source: np.ndarray,
         event: np.ndarray,
         target: int | np.ndarray,
-        distance: np.ndarray,
+        begin: np.ndarray,
+        end: np.ndarray,
         seen: np.ndarray,
         runs: Runs,
     ) -> Choices:
-        """Return walks that no edge stands for, by their distance and what the episode has shown.
+        """Return walks that no edge stands for, by where they begin and lead and what the episode has shown.
 
         :param source: vertices where they begin, shape ``(n,)``
         :param event: events that runs of them are recorded for
         :param target: vertices where they lead
-        :param distance: in radii
+        :param begin: where that is, shape ``(n, goal_dim)`` or ``(goal_dim,)``
+        :param end: where they lead, likewise
         :param seen: 1 where somebody has been near the target, 0 elsewhere
         :param runs: of the episode
         """
-        n = len(source)
-        kind = Kind(distance, seen * self.model.steps_per_radius * distance, seen, np.zeros(n))
+        n, metric = len(source), self.graph.metric
+        distance, changes = metric.travel(begin, end), metric.mismatches(begin, end)
+        kind = Kind(distance, seen * self.model.steps_per_radius * distance, seen, np.zeros(n), changes)
         landing = np.full((n, self.graph.edges.landing.shape[1]), NOWHERE)
         targets = np.broadcast_to(np.asarray(target), (n,)).copy()
         zeros, steps = (np.zeros(n), np.zeros(n)), self.model.steps(kind)
@@ -220,8 +224,8 @@ class ChoiceModel:
             landing,
             np.zeros(landing.shape),
         )
-        for i, (begin, end) in enumerate(zip(event.tolist(), targets.tolist(), strict=True)):
-            for success, where, number in runs.of(begin, end):
+        for i, (in_event, to) in enumerate(zip(event.tolist(), targets.tolist(), strict=True)):
+            for success, where, number in runs.of(in_event, to):
                 guessed.add_runs(i, success, where, EPISODE_WEIGHT * number)
         return guessed
 
@@ -230,27 +234,27 @@ class ChoiceModel:
     ) -> Choices:
         """Return what can be done at the start: what can be done in its event, and walks that can be tried."""
         graph, n_events = self.graph, len(self.graph.events)
-        here, distance = np.array([n_events + 1]), graph.travel(start.point)
+        here = np.array([n_events + 1])
         event = np.array([start.event])
         parts = []
         if start.event != NOWHERE:
             parts += [self._edges(graph.edges.source == start.event, replaced, tried)]
             parts += [to_goal.take(to_goal.source == start.event)]
-            if distance[start.event] > 1.0:
+            if not graph.metric.reached(start.point, graph.centers[start.event]):
                 # At the edge of its event: to walk to the middle first may help.
-                parts.append(self._guessed(here, event, start.event, distance[event], np.ones(1), runs))
+                parts.append(self._guessed(here, event, start.event, start.point, graph.centers[event], np.ones(1), runs))
         else:
             near = np.argsort(graph.distances(start.point), kind="stable")[:NEAR_EVENTS]
             nowhere = np.full(len(near), NOWHERE)
-            parts.append(self._guessed(near, nowhere, near, distance[near], np.zeros(len(near)), runs))
+            parts.append(self._guessed(near, nowhere, near, start.point, graph.centers[near], np.zeros(len(near)), runs))
         targets = np.concatenate([part.target for part in parts])
         if n_events not in targets:
-            away = np.atleast_1d(graph.metric.travel(goal, start.point))
-            direct = self._guessed(here, event, n_events, away, np.zeros(1), runs)
+            direct = self._guessed(here, event, n_events, start.point, goal[None], np.zeros(1), runs)
             # One that would be longer than any walk in the graph is begun only where there is nothing else to do.
             if direct.steps[0] <= graph.walk_steps or not len(targets) or start.towards == n_events:
                 parts.append(direct)
         if start.towards not in (NOWHERE, n_events) and start.towards not in targets:
-            parts.append(self._guessed(here, event, start.towards, distance[[start.towards]], np.ones(1), runs))
+            end = graph.centers[[start.towards]]
+            parts.append(self._guessed(here, event, start.towards, start.point, end, np.ones(1), runs))
         choices = Choices.join(parts)
         return choices._replace(source=np.full(len(choices.source), n_events + 1))

@@ -223,7 +223,7 @@ def evaluate_pairs(
     made = gym.make(env, **(env_kwargs or {})) if isinstance(env, str) else env
     try:
         drawn: Sequence[tuple[np.ndarray | None, np.ndarray | None, float]] = [(None, None, np.nan)] * n_pairs
-        if made.has_wrapper_attr("geometry"):
+        if made.has_wrapper_attr("geometry") and not made.has_wrapper_attr("goal_metric"):
             drawn = sample_pairs(made.get_wrapper_attr("geometry"), made.get_wrapper_attr("body_radius"), n_pairs, seed)
         made.reset(seed=seed)
         results = []

@@ -21,6 +21,8 @@ class Metric(ABC):
     """
 
     radius: float
+    #: Dimensions that have to match.
+    n_matched: int = 0
 
     @abstractmethod
     def distance(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -29,6 +31,10 @@ class Metric(ABC):
     def travel(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
         """Return how far one has to go from one point to another, in radii, shape ``(...)``: without what has to match."""
         return self.distance(a, b) / self.radius
+
+    def mismatches(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        """Tell which of what has to match does not, bool array of shape ``(..., n)``."""
+        return np.zeros((*np.broadcast_shapes(np.shape(a), np.shape(b))[:-1], 0), dtype=bool)
 
     def reached(self, point: np.ndarray, goal: np.ndarray) -> bool:
         """Tell whether who stands at a point, shape ``(goal_dim,)``, has reached a goal of the same shape."""
@@ -247,6 +253,7 @@ class Product(Metric):
         self.parts = parts
         self._measured = [part for part in parts if isinstance(part, Within)]
         self._matched = [i for part in parts if isinstance(part, Exact) for i in part.dims]
+        self.n_matched = len(self._matched)
 
     def check(self, goal_dim: int) -> None:
         """Refuse goals that have not all of the dimensions."""
@@ -263,10 +270,11 @@ class Product(Metric):
 
     def distance(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
         """Return the distance, in radii, shape ``(...)``."""
-        if not self._matched:
-            return self.travel(a, b)
-        apart = np.abs(np.asarray(a)[..., self._matched] - np.asarray(b)[..., self._matched]) > SAME
-        return self.travel(a, b) + MISMATCH * apart.sum(axis=-1)
+        return self.travel(a, b) + MISMATCH * self.mismatches(a, b).sum(axis=-1)
+
+    def mismatches(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        """Tell which of the dimensions differ that have to match, shape ``(..., n)``."""
+        return np.abs(np.asarray(a)[..., self._matched] - np.asarray(b)[..., self._matched]) > SAME
 
     def travel(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
         """Return how far off the part is that is furthest off, shape ``(...)``."""

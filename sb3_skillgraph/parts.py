@@ -123,7 +123,7 @@ class Parts:
         common = Common.build(agent, spec, arguments)
         rng, view_name, view, store, factory, walker, metric = common
         graph = SkillGraph(spec.goal_dim, metric, arguments["max_events"], arguments["walk_steps"])
-        model = WalkModel()
+        model = WalkModel(metric.n_matched)
         planner = Planner(graph, model, horizon(agent.env))
         skills: dict[str, Option] = {}
         runner = Runner(graph, planner, walker.actor, view, skills)

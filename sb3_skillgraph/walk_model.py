@@ -21,6 +21,8 @@ LONG, ENOUGH_LONG = 3.0, 10
 HASTY_GUESS, HASTY_LOSS = 0.1, 0.5
 #: Least standard deviation of a feature: what never varies tells nothing.
 LEAST_SCALE = 0.1
+#: Success of walks that change what has to match in a way nobody has seen it change, before there are runs to learn from.
+CHANGE_GUESS = 0.1
 N_FEATURES = 7
 #: Environment steps of failed runs that the first guess of their length counts for: about two runs.
 PATIENCE_PRIOR = 100.0
@@ -40,12 +42,14 @@ class Kind(NamedTuple):
     :param steps: environment steps that trajectories took (forward, else backward); 0 where there are none
     :param forward: trajectories that went this way
     :param backward: trajectories that went the other way
+    :param changes: which of what has to match (a key, a door) is another where they lead, shape ``(n, n_matched)``
     """
 
     distance: np.ndarray
     steps: np.ndarray
     forward: np.ndarray
     backward: np.ndarray
+    changes: np.ndarray
 
     @property
     def seen(self) -> np.ndarray:
@@ -53,10 +57,10 @@ class Kind(NamedTuple):
         return (self.forward > 0) | (self.backward > 0)
 
     def features(self, fastest: float) -> np.ndarray:
-        """Return what the model goes by, shape ``(n, N_FEATURES)``.
+        """Return what the model goes by, shape ``(n, N_FEATURES + n_matched)``.
 
         Walks whose way was seen forward, seen only backward and never seen at all are of three kinds, each with its own
-        level.
+        level; so are, for each of what has to match, those that would change it as nobody has seen it change.
 
         :param fastest: environment steps that the fastest walks take for a radius
         """
@@ -64,7 +68,8 @@ class Kind(NamedTuple):
         backward = self.seen & (self.forward == 0)
         haste = self.haste(fastest)
         columns = [haste, length, np.log1p(self.forward), backward, backward * length, ~self.seen, ~self.seen * length]
-        return np.stack(columns, axis=1).astype(np.float64)
+        unheard_of = self.changes & (self.forward == 0)[:, None]
+        return np.concatenate([np.stack(columns, axis=1), unheard_of], axis=1).astype(np.float64)
 
     def haste(self, fastest: float) -> np.ndarray:
         """Return by how much trajectories were faster than anybody walks (as a logarithm): luck, or no walk at all.
@@ -80,12 +85,15 @@ class WalkModel:
 
     It is fitted while learning only. ``loss``: which share of failures ends far away or nowhere rather than near where
     the run began, for hasty walks and for others.
+
+    :param n_matched: dimensions of a goal that have to match
     """
 
-    def __init__(self) -> None:
-        self.mean = np.zeros(N_FEATURES)
-        self.scale = np.ones(N_FEATURES)
-        self.coefficients = np.zeros(N_FEATURES)
+    def __init__(self, n_matched: int = 0) -> None:
+        self.n_matched = n_matched
+        self.mean = np.zeros(N_FEATURES + n_matched)
+        self.scale = np.ones(N_FEATURES + n_matched)
+        self.coefficients = np.zeros(N_FEATURES + n_matched)
         self.intercept = float(np.log(FIRST_GUESS / (1.0 - FIRST_GUESS)))
         self.pace = np.array([2.0, 1.0, 0.8])  # steps: a constant, for each radius of distance, for each step of a crossing
         self.steps_per_radius = 5.0  # of walks where nobody has gone
@@ -140,10 +148,12 @@ class WalkModel:
         self.mean = np.average(features, axis=0, weights=weight)
         self.scale = np.sqrt(np.average((features - self.mean) ** 2, axis=0, weights=weight))
         self.scale = np.maximum(self.scale, LEAST_SCALE)
-        # What is guessed first: the mean walk is one of a hardly trained policy, a hasty one hardly ever succeeds.
-        guessed = np.stack([self.mean, self.mean])
+        # What is guessed first: the mean walk is one of a hardly trained policy, a hasty one hardly ever succeeds, nor one
+        # that changes what nobody has seen to change so.
+        guessed = np.tile(self.mean, (2 + self.n_matched, 1))
         guessed[1, 0] = max(guessed[1, 0], np.log(2.0 * HASTY))
-        guesses = np.array([FIRST_GUESS, HASTY_GUESS])
+        guessed[2:, N_FEATURES:][np.eye(self.n_matched, dtype=bool)] = 1.0
+        guesses = np.array([FIRST_GUESS, HASTY_GUESS, *[CHANGE_GUESS] * self.n_matched])
         standardised = (np.concatenate([features, guessed]) - self.mean) / self.scale
         weights = np.concatenate([successes, GUESS_RUNS * guesses, failures, GUESS_RUNS * (1.0 - guesses)])
         outcomes = np.repeat([1, 0], len(standardised))

@@ -12,7 +12,7 @@ from sb3_skillgraph.walk_model import ENOUGH_LONG, FIRST_GUESS, HASTY, HASTY_LOS
 
 def kinds(*rows: tuple[float, float, float, float]) -> Kind:
     """Rows of distance, steps, forward and backward."""
-    return Kind(*np.array(rows, dtype=np.float64).reshape(-1, 4).T)
+    return Kind(*np.array(rows, dtype=np.float64).reshape(-1, 4).T, np.zeros((len(rows), 0), dtype=bool))
 
 
 #: A short walk that was seen, a long one, one whose reverse was seen, and one that nobody has seen.
@@ -118,7 +118,7 @@ def test_hasty_walks_that_come_off_are_trusted_after_all() -> None:
 def test_the_steps_of_walks_are_learned() -> None:
     model, distances = WalkModel(), np.array([1.0, 2.0, 4.0, 6.0])
     crossing = 12.0 * distances  # those who explored wandered about
-    kind = Kind(distances, crossing, np.ones(4), np.zeros(4))
+    kind = Kind(distances, crossing, np.ones(4), np.zeros(4), np.zeros((4, 0), dtype=bool))
     model.fit(kind, np.full(4, 50.0), np.zeros(4), 50.0 * (3.0 + 4.0 * distances))
     np.testing.assert_allclose(model.steps(kind), 3.0 + 4.0 * distances, rtol=0.02)
     assert 4.0 < model.steps_per_radius < 6.0

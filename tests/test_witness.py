@@ -365,7 +365,7 @@ def test_walks_to_goals_teach_of_ways_that_nobody_went() -> None:
         witness.fit()
         model = witness.choice_model.model
         kind = witness.choice_model.kinds()
-        unseen = type(kind)(np.array([3.0]), np.zeros(1), np.zeros(1), np.zeros(1))
+        unseen = type(kind)(np.array([3.0]), np.zeros(1), np.zeros(1), np.zeros(1), np.zeros((1, 0), dtype=bool))
         rates[success] = float(model.success(unseen)[0])
     assert rates[False] < FIRST_GUESS - 0.1 < FIRST_GUESS + 0.3 < rates[True]
 

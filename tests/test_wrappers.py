@@ -9,8 +9,8 @@ import pytest
 from gymnasium.wrappers import TransformAction
 
 import sb3_skillgraph.envs.mujoco_mazes  # noqa: F401 (imports gymnasium-robotics, which registers its ants)
-from sb3_skillgraph import SkillGraphAgent
-from sb3_skillgraph.envs import HoldAction, TellStuck, on_its_back
+from sb3_skillgraph import SkillGraphAgent, evaluate_pairs
+from sb3_skillgraph.envs import FlattenGoals, HoldAction, PursueGoals, TellStuck, on_its_back
 from sb3_skillgraph.hyperparams import load_hyperparams
 
 
@@ -93,3 +93,111 @@ def test_a_body_view_refuses_contact_forces() -> None:
         with pytest.raises(ValueError, match=r"a body with 47 joints, but actions have 8: .*include_cfrc_ext_in_observation"):
             SkillGraphAgent("MultiInputPolicy", env, event_radius=0.45, option_view=view)
     env.close()
+
+
+# -- goals ------------------------------------------------------------------------------------------------------------
+
+
+class Kitchen(gym.Env):
+    """Goals in a dictionary of two entries, as gymnasium-robotics' kitchen has them; the action moves both."""
+
+    goals = gym.spaces.Dict(kettle=gym.spaces.Box(-9, 9, (2,)), lamp=gym.spaces.Box(-9, 9, (1,)))
+    observation_space = gym.spaces.Dict(observation=gym.spaces.Box(-9, 9, (1,)), achieved_goal=goals, desired_goal=goals)
+    action_space = gym.spaces.Box(-1, 1, (3,))
+
+    def _shown(self) -> Any:
+        achieved = {"kettle": self.at[:2].copy(), "lamp": self.at[2:].copy()}
+        wanted = {"kettle": np.array([1.0, 2.0], np.float32), "lamp": np.array([3.0], np.float32)}
+        return {"observation": np.zeros(1, np.float32), "achieved_goal": achieved, "desired_goal": wanted}
+
+    def reset(self, **kwargs: Any) -> Any:
+        super().reset(seed=kwargs.get("seed"))
+        self.at, self.n_steps = np.zeros(3, np.float32), 0
+        return self._shown(), {}
+
+    def step(self, action: Any) -> Any:
+        self.at = np.clip(self.at + action, -5, 5).astype(np.float32)
+        self.n_steps += 1
+        return self._shown(), 0.0, False, self.n_steps >= 50, {}
+
+
+def test_nested_goals_are_flattened_with_a_radius_for_each_entry() -> None:
+    env = FlattenGoals(Kitchen(), {"kettle": 0.5, "lamp": 0.1})
+    observation, _ = env.reset(seed=0)
+    assert env.observation_space.contains(observation)
+    np.testing.assert_array_equal(observation["desired_goal"], [1.0, 2.0, 3.0])
+    near = observation["desired_goal"] + np.array([0.3, 0.3, 0.05])
+    assert env.goal_metric.reached(near, observation["desired_goal"])
+    assert not env.goal_metric.reached(near + np.array([0.0, 0.0, 0.1]), observation["desired_goal"])
+    agent = SkillGraphAgent("MultiInputPolicy", env, learning_starts=100, policy_kwargs=dict(net_arch=[8]), seed=0).learn(300)
+    assert len(agent.events) > 3
+    assert agent.metric.get_state() == env.goal_metric.get_state()
+
+
+def test_only_nested_goals_are_flattened() -> None:
+    with pytest.raises(ValueError, match="Dicts of Boxes"):
+        FlattenGoals(gym.make("SkillGraph/ToyMaze-v0"), 0.1)
+
+
+class Line(gym.Env):
+    """A number that the action moves."""
+
+    observation_space = gym.spaces.Box(-9, 9, (1,), np.float64)
+    action_space = gym.spaces.Box(-1, 1, (1,))
+
+    def reset(self, **kwargs: Any) -> Any:
+        super().reset(seed=kwargs.get("seed"))
+        self.x, self.n_steps = 0.0, 0
+        return np.array([self.x]), {}
+
+    def step(self, action: Any) -> Any:
+        self.x = float(np.clip(self.x + 0.5 * action[0], -5, 5))
+        self.n_steps += 1
+        return np.array([self.x]), -7.0, False, self.n_steps >= 40, {"lap": 3}
+
+
+def pursuing(**kwargs: Any) -> PursueGoals:
+    given = dict(achieved_goal=lambda o: o**2 / 5.0, sample_goal=lambda rng: rng.uniform(0.0, 5.0, 1), radius=0.4)
+    return PursueGoals(Line(), **{**given, **kwargs})
+
+
+def test_two_functions_make_a_goal_environment_of_any() -> None:
+    from stable_baselines3.common.env_checker import check_env
+
+    env = pursuing()
+    check_env(env)
+    observation, info = env.reset(seed=1, options={"goal": [0.1]})
+    assert observation["desired_goal"] == [0.1]
+    assert info["is_success"]
+    again, _ = env.reset(seed=1)
+    other, _ = env.reset()
+    assert again["desired_goal"] == env.reset(seed=1)[0]["desired_goal"] != other["desired_goal"]
+    env.reset(options={"goal": [0.8]})
+    rewards = []
+    for _ in range(6):
+        observation, reward, _, _, info = env.step(np.ones(1))
+        assert info["lap"] == 3
+        assert reward == env.compute_reward(observation["achieved_goal"], observation["desired_goal"], info)
+        rewards.append(reward)
+    assert rewards == [0.0, 0.0, 1.0, 1.0, 0.0, 0.0]  # 0.05, 0.2, 0.45, 0.8, 1.25, 1.8
+
+
+def test_an_agent_learns_to_pursue_the_goals() -> None:
+    env = pursuing(achieved_goal=lambda o: o, sample_goal=lambda rng: rng.uniform(-4.0, 4.0, 1))
+    nets = dict(policy_kwargs=dict(net_arch=[32, 32]), batch_size=32)
+    agent = SkillGraphAgent("MultiInputPolicy", env, learning_starts=300, seed=0, **nets).learn(2_000)
+    assert evaluate_pairs(agent, env, n_pairs=20).success_rate >= 0.8
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (dict(sample_goal=lambda rng: np.zeros(2)), r"shape \(1,\) and sampled ones \(2,\)"),
+        (dict(achieved_goal=lambda o: o[0]), "both must be"),
+        (dict(radius=[0.1, 0.1]), "dimension 1"),
+        (dict(radius=-1.0), "positive"),
+    ],
+)
+def test_functions_that_do_not_fit(arguments: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        pursuing(**arguments)

@@ -8,17 +8,19 @@ import gymnasium as gym
 from sb3_skillgraph.envs.maze_geometry import LARGE_MAZE, MEDIUM_MAZE, OPEN_AREA, U_MAZE, MazeGeometry, MazeMap
 from sb3_skillgraph.envs.task import GoalTask
 from sb3_skillgraph.envs.toy import ToyMazeEnv
-from sb3_skillgraph.envs.wrappers import HoldAction, TellStuck, on_its_back
+from sb3_skillgraph.envs.wrappers import FlattenGoals, HoldAction, PursueGoals, TellStuck, on_its_back
 
 __all__ = [
     "LARGE_MAZE",
     "MEDIUM_MAZE",
     "OPEN_AREA",
     "U_MAZE",
+    "FlattenGoals",
     "GoalTask",
     "HoldAction",
     "MazeGeometry",
     "MazeMap",
+    "PursueGoals",
     "TellStuck",
     "ToyMazeEnv",
     "find",
@@ -37,6 +39,7 @@ _TASKS: dict[str, tuple[str, dict[str, Any]]] = {
     "SkillGraph/PointMazeMedium-v0": (_POINT, {"maze_map": MEDIUM_MAZE}),
     "SkillGraph/PointMazeHard-v0": (_POINT, {"maze_map": LARGE_MAZE}),
     "SkillGraph/PointMaze-v0": (_POINT, {}),
+    "SkillGraph/PointKeyDoor-v0": ("sb3_skillgraph.envs.key_door:PointKeyDoorEnv", {}),
     "SkillGraph/AntUMaze-v0": (_ANT, {"maze_map": U_MAZE}),
     "SkillGraph/AntReacher-v0": (_ANT, {"maze_map": OPEN_AREA}),
     "SkillGraph/AntMedium-v0": (_ANT, {"maze_map": MEDIUM_MAZE}),

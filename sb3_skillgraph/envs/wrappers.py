@@ -1,10 +1,13 @@
-"""What a goal environment may need before its robot can learn: a longer control period, and to tell when it is stuck."""
+"""What an environment may need: a longer control period, to tell when its robot is stuck, flat goals, or goals at all."""
 
 from collections.abc import Callable
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from gymnasium import spaces
+
+from sb3_skillgraph.metric import Product, Within, as_metric
 
 _UPRIGHT = 0.2  # upward component of the torso's axis below which it lies on its side or back
 
@@ -77,3 +80,123 @@ def lies_down(quaternion: np.ndarray) -> bool:
     """
     _, x, y, _ = quaternion.tolist()
     return 1.0 - 2.0 * (x * x + y * y) <= _UPRIGHT
+
+
+class FlattenGoals(gym.ObservationWrapper):
+    """
+    Makes one vector of goals that are nested dictionaries, such as those of gymnasium-robotics' FrankaKitchen.
+
+    A goal is reached where each of its entries is within ``radius`` of what it should be, which ``goal_metric`` tells.
+
+    :param env: an environment whose goals are Dicts of Boxes
+    :param radius: of every entry, in its own units, or of each by name
+    :raises ValueError: if its goals are no such dictionaries
+    """
+
+    def __init__(self, env: gym.Env, radius: float | dict[str, float]) -> None:
+        super().__init__(env)
+        space = env.observation_space
+        goals = space["achieved_goal"] if isinstance(space, spaces.Dict) and "achieved_goal" in space.spaces else space
+        if not isinstance(space, spaces.Dict) or not isinstance(goals, spaces.Dict) or goals is space:
+            raise ValueError(f"FlattenGoals is for goals that are Dicts of Boxes; these are {goals}.")
+        flat = spaces.flatten_space(goals)
+        self.observation_space = spaces.Dict({**space.spaces, "achieved_goal": flat, "desired_goal": flat})
+        self._goals = goals
+        parts, first = [], 0
+        for name, box in goals.spaces.items():
+            last = first + spaces.flatdim(box)
+            parts.append(Within(range(first, last), radius[name] if isinstance(radius, dict) else radius))
+            first = last
+        self.goal_metric = Product(*parts)
+
+    def observation(self, observation: Any) -> dict[str, Any]:
+        """Return an observation with flat goals, shape ``(goal_dim,)``.
+
+        :param observation: of the wrapped environment
+        """
+        return {
+            **observation,
+            **{key: spaces.flatten(self._goals, observation[key]) for key in ("achieved_goal", "desired_goal")},
+        }
+
+
+class PursueGoals(gym.Wrapper):
+    """
+    Makes a goal environment of any environment with Box observations.
+
+    At each reset a goal is drawn; ``reset(options={"goal": ...})`` gives one. ``info["is_success"]`` tells whether it is
+    reached now, the reward is 1 then and 0 elsewhere.
+
+    :param env: an environment with Box observations
+    :param achieved_goal: function of an observation: where the agent has got to, shape ``(goal_dim,)``
+    :param sample_goal: function of a generator: a goal, same shape
+    :param radius: how near a goal is reached, as the agent's ``event_radius`` has it
+    :raises ValueError: if observations are no Box, or the two functions do not fit
+    """
+
+    def __init__(
+        self,
+        env: gym.Env,
+        achieved_goal: Callable[[np.ndarray], np.ndarray],
+        sample_goal: Callable[[np.random.Generator], np.ndarray],
+        radius: Any,
+    ) -> None:
+        super().__init__(env)
+        if not isinstance(env.observation_space, spaces.Box):
+            raise ValueError(f"PursueGoals is for environments with Box observations, not {env.observation_space}.")
+        self._achieved_goal, self._sample_goal = achieved_goal, sample_goal
+        shape = self._achieved(np.zeros(env.observation_space.shape, dtype=env.observation_space.dtype)).shape
+        self.goal = self._drawn(np.random.default_rng(0))
+        if len(shape) != 1 or self.goal.shape != shape:
+            raise ValueError(
+                f"Achieved goals have shape {shape} and sampled ones {self.goal.shape}: both must be (goal_dim,)."
+            )
+        self.goal_metric = as_metric(radius)
+        self.goal_metric.check(shape[0])
+        goals = spaces.Box(-np.inf, np.inf, shape, np.float64)
+        self.observation_space = spaces.Dict(observation=env.observation_space, achieved_goal=goals, desired_goal=goals)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode with a goal.
+
+        :param seed: seed of the environment and of the goals
+        :param options: ``"goal"``, shape ``(goal_dim,)``; what else there is goes to the wrapped environment
+        """
+        options = dict(options or {})
+        given = options.pop("goal", None)
+        observation, info = self.env.reset(seed=seed, options=options or None)
+        drawn = self._drawn(self.np_random)
+        self.goal = drawn if given is None else np.asarray(given, dtype=np.float64)
+        shown = self._shown(observation)
+        return shown, {**info, "is_success": self._is_reached(shown)}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Take a step.
+
+        :param action: action of the wrapped environment
+        """
+        observation, _, terminated, truncated, info = self.env.step(action)
+        shown = self._shown(observation)
+        success = self._is_reached(shown)
+        return shown, float(success), terminated, truncated, {**info, "is_success": success}
+
+    def compute_reward(self, achieved_goal: np.ndarray, desired_goal: np.ndarray, info: Any) -> np.ndarray:
+        """Return 1 where a goal is reached and 0 elsewhere, shape ``(...)``; for relabelling.
+
+        :param achieved_goal: shape ``(..., goal_dim)``
+        :param desired_goal: same shape
+        :param info: not used
+        """
+        return np.asarray(self.goal_metric.distance(achieved_goal, desired_goal) <= self.goal_metric.radius, dtype=np.float64)
+
+    def _achieved(self, observation: np.ndarray) -> np.ndarray:
+        return np.asarray(self._achieved_goal(observation), dtype=np.float64)
+
+    def _drawn(self, rng: np.random.Generator) -> np.ndarray:
+        return np.asarray(self._sample_goal(rng), dtype=np.float64)
+
+    def _shown(self, observation: np.ndarray) -> dict[str, np.ndarray]:
+        return {"observation": observation, "achieved_goal": self._achieved(observation), "desired_goal": self.goal.copy()}
+
+    def _is_reached(self, shown: dict[str, np.ndarray]) -> bool:
+        return self.goal_metric.reached(shown["achieved_goal"], self.goal)

@@ -19,7 +19,8 @@ FIT_EVERY = 1_000
 N_SAMPLES = 1_000
 #: Failures that nothing is known of, in the share that land far away: few say little.
 FAR_PRIOR = 2.0
-#: Columns of the samples: distance (event radii), whether the goal's event was where it began, success, steps.
+#: Columns of the samples: distance (event radii), whether the goal's event was where it began, success, steps; then what
+#: has to match and did not where it began.
 _COLUMNS = 4
 
 
@@ -72,7 +73,7 @@ class Witness:
     def __init__(self, graph: SkillGraph, choice_model: ChoiceModel, n_envs: int) -> None:
         self.graph = graph
         self.choice_model = choice_model
-        self._samples = np.zeros((N_SAMPLES, _COLUMNS))
+        self._samples = np.zeros((N_SAMPLES, _COLUMNS + choice_model.model.n_matched))
         self._n_samples = 0
         self._n_steps = 0  # of all environments, since the last fit
         self.cut(n_envs)
@@ -191,10 +192,11 @@ class Witness:
                 graph.ran(source, target, run.success, graph.index(run.landing), run.steps)
             return
         if run.option == DIRECT:
-            distance = float(graph.metric.travel(run.aim, self._began[run.env]))
+            ends = run.aim, self._began[run.env]
+            distance, changes = float(graph.metric.travel(*ends)), graph.metric.mismatches(*ends)
             at_home = source != NOWHERE and graph.locate(run.aim) == source
             row = self._n_samples % N_SAMPLES
-            self._samples[row] = distance, at_home, run.success, run.steps
+            self._samples[row] = distance, at_home, run.success, run.steps, *changes
             self._n_samples += 1
 
     def fit(self) -> None:
@@ -202,9 +204,10 @@ class Witness:
         graph, edges, model = self.graph, self.graph.edges, self.choice_model.model
         aging = graph.aging()
         samples = self._samples[: min(self._n_samples, N_SAMPLES)]
-        distance, at_home, success, steps = samples.T
+        distance, at_home, success, steps = samples[:, :_COLUMNS].T
         kinds = self.choice_model.kinds()
-        direct = Kind(distance, at_home * distance * model.steps_per_radius, at_home, np.zeros(len(samples)))
+        known = at_home * distance * model.steps_per_radius, at_home, np.zeros(len(samples))
+        direct = Kind(distance, *known, samples[:, _COLUMNS:] > 0.0)
         model.fit(
             Kind(*(np.concatenate(columns) for columns in zip(kinds, direct, strict=True))),
             np.concatenate([edges.successes * aging, success]),
