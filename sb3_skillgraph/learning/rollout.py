@@ -7,6 +7,7 @@ from stable_baselines3.common.noise import ActionNoise
 
 from sb3_skillgraph.choices import OPTIMISTIC
 from sb3_skillgraph.learning.missions import Agenda, Mission
+from sb3_skillgraph.learning.scale import Scale
 from sb3_skillgraph.learning.witness import Witness
 from sb3_skillgraph.memory.store import TransitionStore
 from sb3_skillgraph.planning import DIRECT
@@ -58,6 +59,7 @@ class Rollout:
         self.rng = rng
         self.pending: Step | None = None
         self.n_stuck = 0  # episodes given up
+        self.scale: Scale | None = Scale(runner.graph.metric)  # until it has told
         self.ran: dict[str, int] = {}  # environment steps of each skill since there was training
         self.n_steps = 0  # and of all together
         self._forget()
@@ -182,6 +184,9 @@ class Rollout:
                 skills[option].replay.add_rows(rows[i : i + 1])
                 self.ran[option] = self.ran.get(option, 0) + 1
         self.n_steps += len(points)
+        if self.scale is not None and self.scale.observe(step.observation["achieved_goal"], points, dones):
+            self.scale.tell()
+            self.scale = None
         for i in np.flatnonzero(step.state.steps == 1).tolist():
             self.witness.began(i, step.observation["achieved_goal"][i])
         self.state, runs = self.runner.advance(step.state, points, stuck)
@@ -223,6 +228,7 @@ class Rollout:
         :param state: the state
         :param same_envs: whether the environments go on where they were; else they begin anew
         """
+        self.scale = None  # a warning at the begin of learning is enough
         self.n_stuck, self.ran, self.n_steps = state["n_stuck"], dict(state["ran"]), state["n_steps"]
         self.witness.set_state(state["witness"])
         self.missions.set_state(state["missions"])

@@ -1,0 +1,80 @@
+"""The agent tells early, once and with numbers, where the event radius does not fit what it moves."""
+
+import warnings
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from sb3_skillgraph import SkillGraphAgent
+from sb3_skillgraph.learning.scale import LOOK_AT, Scale
+from sb3_skillgraph.metric import Ball
+
+TOY = "SkillGraph/ToyMaze-v0"
+
+
+def told(scale: Scale) -> list[str]:
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        scale.tell()
+    return [str(warning.message) for warning in caught]
+
+
+def walked(step: float, length: int, n_envs: int = 2) -> Scale:
+    """A scale that has seen agents go along a line and back, episodes of ``length`` steps."""
+    scale, x, t = Scale(Ball(0.5)), np.zeros((n_envs, 1)), 0
+    seen = False
+    while not seen:
+        t += 1
+        after = x + step
+        done = t % length == 0
+        seen = scale.observe(x, after, np.full(n_envs, done))
+        x = np.zeros_like(x) if done else after
+    assert t == -(-LOOK_AT // n_envs)
+    return scale
+
+
+@pytest.mark.parametrize(
+    ("step", "length", "messages"),
+    [
+        (0.1, 50, []),
+        (0.001, 50, ["in the median (0.1 at most)"]),
+        (1.5, 50, ["3.0 event radii long"]),
+        (0.1, 4, ["0.8 event radii from its begin"]),
+        (0.1, 10_000, []),
+    ],
+)
+def test_what_is_told(step: float, length: int, messages: list[str]) -> None:
+    texts = told(walked(step, length))
+    assert len(texts) == len(messages)
+    assert all(message in text for message, text in zip(messages, texts, strict=True))
+
+
+class Pinned(gym.ObservationWrapper):
+    """The achieved goal stays where it began."""
+
+    def observation(self, observation: Any) -> Any:
+        return {**observation, "achieved_goal": np.zeros(2)}
+
+
+def learn(env: gym.Env, **kwargs: Any) -> list[str]:
+    agent = SkillGraphAgent("MultiInputPolicy", env, learning_starts=10_000, seed=0, option_view="relative", **kwargs)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        agent.learn(2 * LOOK_AT)
+    return [str(warning.message) for warning in caught if "event radii" in str(warning.message)]
+
+
+def test_an_agent_whose_goal_hardly_moves_says_so_once() -> None:
+    texts = learn(Pinned(gym.make(TOY)))
+    assert len(texts) == 1
+    assert "there is no graph to plan on" in texts[0]
+
+
+def test_radii_that_fit_and_that_do_not() -> None:
+    assert not learn(gym.make(TOY))
+    assert "small for it" in learn(gym.make(TOY), event_radius=0.02)[0]
+    assert (
+        "large for this environment" in learn(gym.make(TOY, maze_map=[[1, 1, 1], [1, 0, 1], [1, 1, 1]]), event_radius=5.0)[0]
+    )
