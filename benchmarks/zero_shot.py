@@ -73,9 +73,11 @@ def described(result: PairsResult) -> dict[str, Any]:
 
 def steps_over_straight_on(run: dict[str, Any]) -> float:
     """Return the steps of the trained agent over those of the walker sent straight on, over the pairs that both reached."""
-    both = [(a[1], b[1]) for a, b in zip(run["checks"][-1]["pairs"], run["straight_on"]["pairs"], strict=True) if a[0] and b[0]]
-    steps, straight = np.sum(both, axis=0) if both else (np.nan, np.nan)
-    return float(steps / straight)
+    both = [
+        (a[1], b[1]) for a, b in zip(run["checks"][-1]["pairs"], run["straight_on"]["pairs"], strict=True) if a[0] and b[0]
+    ]
+    ours, straight = np.sum(both, axis=0) if both else (np.nan, np.nan)
+    return float(ours / straight)
 
 
 def promises(runs: list[dict[str, Any]]) -> dict[str, Any]:

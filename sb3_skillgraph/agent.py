@@ -19,7 +19,7 @@ from stable_baselines3.td3.policies import MultiInputPolicy
 
 from sb3_skillgraph import persistence
 from sb3_skillgraph.events import Event
-from sb3_skillgraph.goal_env import GoalSpec, as_batch, as_goal, check_finite, refuse_vec_normalize, rows, with_terminal
+from sb3_skillgraph.goal_env import GoalSpec, as_batch, as_goal, check_finite, refuse_changed_goals, rows, with_terminal
 from sb3_skillgraph.interrupts import Interrupts
 from sb3_skillgraph.learning.episodes import Episodes
 from sb3_skillgraph.learning.salience import Salience
@@ -135,7 +135,7 @@ class SkillGraphAgent(OffPolicyAlgorithm):
         self._arguments = {k: v for k, v in locals().items() if k not in ("self", "env", "_init_setup_model", "__class__")}
         if isinstance(policy, str) and policy not in self.policy_aliases:
             raise ValueError(f"Unknown policy {policy!r}: goal environments have Dict observations, use 'MultiInputPolicy'.")
-        refuse_vec_normalize(env)
+        refuse_changed_goals(env)
         if env is not None and not isinstance(env, str):
             GoalSpec.of(env.observation_space, env.action_space)  # before SB3 asserts less clearly
         super().__init__(
@@ -189,7 +189,14 @@ class SkillGraphAgent(OffPolicyAlgorithm):
         # Under SB3's names as well: CheckpointCallback looks for the one, users for the other.
         self.replay_buffer = self.parts.store
         self.policy = self.parts.walker.learner.policy
+        self.policy.predict = self._predict_by_policy  # type: ignore[method-assign]
         self.episodes = Episodes(self)
+
+    def _predict_by_policy(self, observation: Any, *args: Any, **kwargs: Any) -> Any:
+        """Act on the environment's observations where ``policy.predict`` is asked: the walker's policy sees others."""
+        if isinstance(observation, dict):
+            return self.predict(observation, *args, **kwargs)
+        return type(self.policy).predict(self.policy, observation, *args, **kwargs)
 
     def _build_parts(self) -> Any:
         if self.rules is None:
@@ -339,6 +346,8 @@ class SkillGraphAgent(OffPolicyAlgorithm):
 
     def _train(self, learner: OffPolicyAlgorithm, gradient_steps: int, batch_size: int) -> None:
         learner._current_progress_remaining = self._current_progress_remaining
+        own = self._arguments["option_kwargs"] or {}
+        learner.gamma, learner.tau = own.get("gamma", self.gamma), own.get("tau", self.tau)  # may have been changed
         learner.train(gradient_steps, batch_size)
         for name, value in learner.logger.name_to_value.items():
             if name != "train/n_updates":
@@ -561,7 +570,7 @@ class SkillGraphAgent(OffPolicyAlgorithm):
         :param force_reset: whether ``learn`` begins at a fresh episode; False to go on where the saved environments were
         :raises ValueError: if the environment does not fit, or is normalised by VecNormalize
         """
-        refuse_vec_normalize(env)
+        refuse_changed_goals(env)
         super().set_env(env, force_reset)
         if force_reset:
             self._env_snapshot, self._loaded = None, ""

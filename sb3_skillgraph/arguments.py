@@ -1,5 +1,6 @@
 """An agent's arguments: what they may be, and what follows from them and from the environment."""
 
+from inspect import signature
 from typing import Any
 
 import numpy as np
@@ -125,15 +126,12 @@ def option_kwargs(agent: OffPolicyAlgorithm, arguments: dict[str, Any]) -> dict[
 
     :param agent: gives SB3's arguments
     :param arguments: the agent's keyword arguments
-    :raises ValueError: if the learning rate is a schedule where none is taken
     """
     cls = option_class(arguments["option_class"])
-    kwargs: dict[str, Any] = dict(
-        gamma=agent.gamma, tau=agent.tau, policy_kwargs={"net_arch": NET_ARCH, **agent.policy_kwargs}
-    )
+    kwargs: dict[str, Any] = dict(gamma=agent.gamma, policy_kwargs={"net_arch": NET_ARCH, **agent.policy_kwargs})
+    if "tau" in signature(cls.__init__).parameters or issubclass(cls, OptionLearner):
+        kwargs.update(tau=agent.tau)  # CrossQ has no target networks
     if issubclass(cls, OptionLearner):
-        if callable(agent.learning_rate):
-            raise ValueError(f"{cls.__name__} takes constant learning rates; for a schedule use option_class=TD3 or SAC.")
         kwargs.update(actor_learning_rate=agent.learning_rate, critic_learning_rate=agent.learning_rate)
         kwargs.update(saturation_penalty=SATURATION_PENALTY)
     else:

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from gymnasium import spaces
-from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
+from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, is_vecenv_wrapped, unwrap_vec_normalize
 
 from sb3_skillgraph.metric import Metric, Product, Rotation, Within, as_metric
 from sb3_skillgraph.options.views import BODY_NUMBERS, View, as_view, body_view, egocentric_view, placed_body_view
@@ -54,12 +54,17 @@ class GoalSpec(NamedTuple):
         return cls(*sizes)
 
 
-def refuse_vec_normalize(env: Any) -> None:
-    """Refuse an environment that normalises its observations.
+def refuse_changed_goals(env: Any) -> None:
+    """Refuse an environment that shows goals as something else.
 
     :param env: an environment or VecEnv
-    :raises ValueError: if VecNormalize is around it
+    :raises ValueError: if VecNormalize or VecFrameStack is around it
     """
+    if isinstance(env, VecEnv) and is_vecenv_wrapped(env, VecFrameStack):
+        raise ValueError(
+            "VecFrameStack is not supported: it stacks goals, too, and a stack of positions is no place to go. Put what the "
+            "agent should remember into 'observation' by a wrapper of your own."
+        )
     if isinstance(env, VecEnv) and unwrap_vec_normalize(env) is not None:
         raise ValueError(
             "VecNormalize is not supported: events and initiation sets live in raw goal space. Networks see goal space in "

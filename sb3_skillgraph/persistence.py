@@ -19,7 +19,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.save_util import recursive_getattr
 from stable_baselines3.common.utils import check_for_correct_spaces
 
-from sb3_skillgraph.goal_env import refuse_vec_normalize
+from sb3_skillgraph.goal_env import refuse_changed_goals
 from sb3_skillgraph.options.learner import OptionDDPG, OptionLearner, OptionTD3
 from sb3_skillgraph.rules import PaperRules
 from sb3_skillgraph.saving import MissingCallable, PathOrFile, known_class, load_tree
@@ -58,8 +58,9 @@ def _update_path(learner: OffPolicyAlgorithm) -> str:
 def _arguments(agent: Any) -> dict[str, Any]:
     """Return the constructor's arguments; those of SB3 that are read from attributes while learning as they are now."""
     arguments = dict(agent._arguments)
-    for name in ("batch_size", "gradient_steps", "learning_starts", "verbose"):
+    for name in ("batch_size", "gamma", "gradient_steps", "learning_starts", "tau", "tensorboard_log", "verbose"):
         arguments[name] = getattr(agent, name)
+    arguments["train_freq"] = (agent.train_freq.frequency, agent.train_freq.unit.value)
     arguments["event_radius"] = agent.metric.get_state()
     if agent.rules is not None:
         arguments["rules"] = asdict(agent.rules)
@@ -140,7 +141,7 @@ def _build(cls: Any, tree: dict[str, Any], env: Any, device: Any, given: dict[st
     agent.n_envs = tree["n_envs"]
     if env is not None:
         wrapped = cls._wrap_env(env, agent.verbose)
-        refuse_vec_normalize(wrapped)
+        refuse_changed_goals(wrapped)
         check_for_correct_spaces(wrapped, agent.observation_space, agent.action_space)
         agent.env, agent.n_envs = wrapped, wrapped.num_envs
     noise = agent.action_noise

@@ -111,7 +111,6 @@ OUT_OF_RANGE: list[dict[str, Any]] = [
     dict(event_radius={"parts": []}),
     dict(goal_tolerance=0.0),
     dict(goal_tolerance=1.5),
-    dict(learning_rate=lambda progress: 1e-3 * progress),
     dict(learning_rate=-1.0),
     dict(learning_starts=-1),
     dict(buffer_size=0),

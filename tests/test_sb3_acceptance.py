@@ -1,8 +1,10 @@
 """SB3's own acceptance tests, re-expressed for SkillGraphAgent: it behaves as any SB3 algorithm does."""
 
 import csv
+import io
 import warnings
 from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -34,11 +36,13 @@ from stable_baselines3.common.callbacks import (
     StopTrainingOnNoModelImprovement,
     StopTrainingOnRewardThreshold,
 )
+from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
+from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecFrameStack
 
 from sb3_skillgraph import SkillGraphAgent
 from sb3_skillgraph.runner import RunnerState
@@ -437,3 +441,61 @@ def test_what_is_learned_is_no_secret(trained: SkillGraphAgent) -> None:
         assert (source in ids) != (target in ids)
         assert all(value >= 0.0 for value in attributes.values())
     assert repr(trained) == f"<SkillGraphAgent after {trained.num_timesteps} steps: {trained.graph!r}>"
+
+
+# -- habits -----------------------------------------------------------------------------------------------------------
+
+
+def small(**kwargs: Any) -> SkillGraphAgent:
+    nets = dict(policy_kwargs=dict(net_arch=[16, 16]), learning_starts=50, batch_size=16, seed=0)
+    return SkillGraphAgent("MultiInputPolicy", gym.make(TOY), **{**nets, **kwargs})
+
+
+@pytest.mark.parametrize("option_class", ["OptionDDPG", "OptionTD3", "TD3", "SAC"])
+def test_a_learning_rate_may_follow_a_schedule(option_class: str) -> None:
+    agent = small(learning_rate=lambda left: 1e-3 * left + 1e-5, option_class=option_class)
+    agent.learn(200)
+    optimizer = agent.parts.walker.learner.actor.optimizer
+    assert optimizer.param_groups[0]["lr"] == pytest.approx(1e-5, abs=1.1e-5)
+    assert agent.logger.name_to_value.get("train/learning_rate", 1e-5) < 3e-5
+
+
+def test_the_policy_acts_on_what_the_environment_shows() -> None:
+    agent = small().learn(100)
+    observation = agent.get_env().reset()  # type: ignore[union-attr]
+    np.testing.assert_array_equal(agent.policy.predict(observation)[0], agent.predict(observation)[0])
+    seen = np.zeros((1, *agent.policy.observation_space.shape), dtype=np.float32)  # type: ignore[misc]
+    assert agent.policy.predict(seen)[0].shape == (1, 2)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("name", ["TQC", "CrossQ"])
+def test_sb3_contribs_off_policy_classes(name: str) -> None:
+    contrib = pytest.importorskip("sb3_contrib")
+    cls = getattr(contrib, name)
+    agent = small(option_class=cls).learn(150)
+    file = io.BytesIO()
+    agent.save(file)
+    with pytest.raises(ValueError, match=r"load\(\.\.\., option_class"):
+        SkillGraphAgent.load(io.BytesIO(file.getvalue()))
+    loaded = SkillGraphAgent.load(io.BytesIO(file.getvalue()), env=gym.make(TOY), option_class=cls)
+    observation, _ = gym.make(TOY).reset(seed=0)
+    np.testing.assert_array_equal(loaded.predict(observation)[0], agent.predict(observation)[0])
+
+
+def test_stacked_goals_are_refused() -> None:
+    with pytest.raises(ValueError, match="VecFrameStack is not supported"):
+        SkillGraphAgent("MultiInputPolicy", VecFrameStack(make_vec_env(TOY), 2))
+
+
+def test_attributes_changed_after_construction_count_and_are_saved() -> None:
+    agent = small()
+    agent.gamma, agent.tau, agent.batch_size, agent.tensorboard_log = 0.9, 0.1, 8, None
+    agent.train_freq = TrainFreq(4, TrainFrequencyUnit.STEP)
+    agent.learn(100)
+    learner = agent.parts.walker.learner
+    assert (learner.gamma, learner.tau) == (0.9, 0.1)
+    assert agent._n_updates == 13  # after steps 52, 56, ..., 100
+    file = io.BytesIO()
+    agent.save(file)
+    loaded = SkillGraphAgent.load(io.BytesIO(file.getvalue()))
+    assert (loaded.gamma, loaded.tau, loaded.batch_size, loaded.train_freq) == (0.9, 0.1, 8, agent.train_freq)

@@ -1,12 +1,12 @@
 """Building options: a headless SB3 model each, with a view of the shared store as its replay buffer."""
 
 import copy
+from inspect import signature
 from typing import Any
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3 import SAC
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
@@ -102,7 +102,7 @@ class OptionFactory:
     def _learner(self, replay: OptionReplay) -> OffPolicyAlgorithm:
         """Build the SB3 model without an environment, a logger's folder, or a reseeding of the global generators."""
         kwargs = dict(self.option_kwargs)
-        if issubclass(self.option_class, SAC):
+        if "target_entropy" in signature(self.option_class.__init__).parameters:
             kwargs.setdefault("target_entropy", -float(self.action_space.low.size))  # SAC's "auto" asks an environment
         constructor: Any = self.option_class
         learner: OffPolicyAlgorithm = constructor("MlpPolicy", None, _init_setup_model=False, device=self.device, **kwargs)

@@ -11,8 +11,8 @@ from typing import Any, ClassVar
 
 import torch as th
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, PyTorchObs, ReplayBufferSamples
-from stable_baselines3.common.utils import polyak_update
+from stable_baselines3.common.type_aliases import GymEnv, PyTorchObs, ReplayBufferSamples, Schedule
+from stable_baselines3.common.utils import polyak_update, update_learning_rate
 from stable_baselines3.ddpg.ddpg import DDPG
 from stable_baselines3.td3.policies import TD3Policy
 from stable_baselines3.td3.td3 import TD3
@@ -45,8 +45,8 @@ class OptionLearner(TD3):
 
     :param policy: the policy model to use (MlpPolicy, CnnPolicy, ...)
     :param env: the environment to learn from (if registered in Gym, can be str; None builds no environment)
-    :param actor_learning_rate: Adam's learning rate for the actor
-    :param critic_learning_rate: Adam's learning rate for the critics
+    :param actor_learning_rate: Adam's learning rate for the actor, or a schedule of it
+    :param critic_learning_rate: Adam's learning rate for the critics, likewise
     :param saturation_penalty: weight, in the actor's loss, of the mean squared norm of what its tanh is given: an actor
         that an untrained critic has driven to the bounds of the actions finds its way back; 0 is SB3's loss
     :param kwargs: all other arguments of the SB3 class except ``learning_rate``, which these two replace
@@ -59,8 +59,8 @@ class OptionLearner(TD3):
         policy: str | type[TD3Policy],
         env: GymEnv | str | None,
         *,
-        actor_learning_rate: float = 1e-4,
-        critic_learning_rate: float = 1e-3,
+        actor_learning_rate: float | Schedule = 1e-4,
+        critic_learning_rate: float | Schedule = 1e-3,
         saturation_penalty: float = 0.0,
         **kwargs: Any,
     ) -> None:
@@ -79,12 +79,12 @@ class OptionLearner(TD3):
             (self.actor.optimizer, self.actor_learning_rate),
             (self.critic.optimizer, self.critic_learning_rate),
         ):
-            for group in optimizer.param_groups:
-                group["lr"] = learning_rate
+            rate = learning_rate(self._current_progress_remaining) if callable(learning_rate) else learning_rate
+            update_learning_rate(optimizer, rate)
 
     def _update_learning_rate(self, optimizers: list[th.optim.Optimizer] | th.optim.Optimizer) -> None:
-        self.logger.record("train/learning_rate", self.critic_learning_rate)
         self._set_learning_rates()
+        self.logger.record("train/learning_rate", self.critic.optimizer.param_groups[0]["lr"])
 
     def train(self, gradient_steps: int, batch_size: int = 100) -> None:
         """
@@ -217,8 +217,8 @@ class OptionDDPG(OptionLearner, DDPG):
 
     :param policy: the policy model to use (MlpPolicy, CnnPolicy, ...)
     :param env: the environment to learn from (if registered in Gym, can be str; None builds no environment)
-    :param actor_learning_rate: Adam's learning rate for the actor
-    :param critic_learning_rate: Adam's learning rate for the critics
+    :param actor_learning_rate: Adam's learning rate for the actor, or a schedule of it
+    :param critic_learning_rate: Adam's learning rate for the critics, likewise
     :param saturation_penalty: weight, in the actor's loss, of the mean squared norm of what its tanh is given: an actor
         that an untrained critic has driven to the bounds of the actions finds its way back; 0 is SB3's loss
     :param kwargs: all other arguments of ``stable_baselines3.DDPG`` except ``learning_rate``
@@ -234,8 +234,8 @@ class OptionTD3(OptionLearner, TD3):
 
     :param policy: the policy model to use (MlpPolicy, CnnPolicy, ...)
     :param env: the environment to learn from (if registered in Gym, can be str; None builds no environment)
-    :param actor_learning_rate: Adam's learning rate for the actor
-    :param critic_learning_rate: Adam's learning rate for the critics
+    :param actor_learning_rate: Adam's learning rate for the actor, or a schedule of it
+    :param critic_learning_rate: Adam's learning rate for the critics, likewise
     :param saturation_penalty: weight, in the actor's loss, of the mean squared norm of what its tanh is given: an actor
         that an untrained critic has driven to the bounds of the actions finds its way back; 0 is SB3's loss
     :param kwargs: all other arguments of ``stable_baselines3.TD3`` except ``learning_rate``
