@@ -340,6 +340,7 @@ class SkillGraphAgent(OffPolicyAlgorithm):
         for option, n_updates in self.parts.learners(gradient_steps):
             if n_updates > 0 and option.replay.size() >= batch_size:
                 self._train(option.learner, n_updates, batch_size)
+        self.parts.learned(gradient_steps)
         self._n_updates += gradient_steps
         self.graph.now = float(self._n_updates)  # records age as the walker learns
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
@@ -506,6 +507,7 @@ class SkillGraphAgent(OffPolicyAlgorithm):
             persistence.set_parameters(learner, load_path_or_dict, exact_match, device)
         else:
             persistence.load_parameters(learner, load_tree(load_path_or_dict, "agent"), exact_match, device)
+        self.parts.average.restart()
 
     def save(self, path: PathOrFile, exclude: Iterable[str] | None = None, include: Iterable[str] | None = None) -> None:
         """

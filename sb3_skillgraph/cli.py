@@ -4,7 +4,6 @@ import argparse
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -20,10 +19,11 @@ from sb3_skillgraph.envs import find, geometry_of
 from sb3_skillgraph.evaluation import NoPairsError, PairsResult, Predictor, evaluate_pairs
 from sb3_skillgraph.experiments.commands import add_compare, add_figure, add_status
 from sb3_skillgraph.experiments.console import UserError, assignment, for_people, positive
-from sb3_skillgraph.experiments.run_folder import AGENT, EXPERIENCE, is_unfinished
+from sb3_skillgraph.experiments.run_folder import AGENT, CONFIG, EXPERIENCE, is_unfinished, run_config
 from sb3_skillgraph.experiments.training import train, write_json
 from sb3_skillgraph.hyperparams import check_hyperparams, did_you_mean, load_hyperparams
 from sb3_skillgraph.plotting import plot_plan, plot_skill_graph, run_plan, save_figure
+from sb3_skillgraph.version import __version__
 
 DEMO_ENV, DEMO_STEPS, DEMO_PAIRS = "SkillGraph/PointMazeMedium-v0", 20_000, 100
 USER_ERROR, INTERRUPTED = 2, 130
@@ -48,7 +48,7 @@ def build_parser() -> argparse.ArgumentParser:
         prog="sb3-skillgraph",
         description="Deep Skill Graphs: learn skills without reward, plan over them to goals never trained on.",
     )
-    parser.add_argument("--version", action="version", version=version("sb3_skillgraph"))
+    parser.add_argument("--version", action="version", version=__version__)
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
     _add_train(commands)
     _add_evaluate(commands)
@@ -80,6 +80,11 @@ def _add_env_kwargs(command: argparse.ArgumentParser) -> None:
     )
 
 
+def _add_agent(command: argparse.ArgumentParser) -> None:
+    command.add_argument("agent", type=Path, metavar="RUN", help="folder that train has filled, or an agent.zip")
+    command.add_argument("--env", metavar="ENV", help="environment id (default: that of the run)")
+
+
 def _add_train(commands: Any) -> None:
     command = _add_command(
         commands,
@@ -89,7 +94,8 @@ def _add_train(commands: Any) -> None:
         "Arguments of the agent come from its signature, then from the environment's entry in hyperparams/*.yml, then\n"
         "from --hyperparams. OUT receives agent.zip, experience.zip (what it has met, for evaluate --adapt), progress.csv\n"
         "and config.json. Ctrl-C saves the agent, too. However it was interrupted, the same command goes on from the last\n"
-        "checkpoint, and comes to the same as in one go (of environments that tell their state, as SkillGraph/* do).\n\n"
+        "checkpoint, and comes to the same as in one go (of environments that tell their state, as SkillGraph/* do); with\n"
+        "more --steps it trains a finished agent further.\n\n"
         "example:\n  sb3-skillgraph train SkillGraph/PointMazeUMaze-v0 --steps 50000 --out runs/umaze\n"
         "  sb3-skillgraph train SkillGraph/ToyMaze-v0 --hyperparams salience=rrt policy_kwargs='{net_arch: [64, 64]}'",
     )
@@ -98,7 +104,8 @@ def _add_train(commands: Any) -> None:
     command.add_argument("--out", type=Path, help="folder for the results (default: runs/<environment>-seed<seed>)")
     command.add_argument("--n-envs", type=positive, default=1, help="copies of the environment (default: 1)")
     command.add_argument("--device", default="auto", help="torch device: auto, cpu, cuda (default: auto)")
-    command.add_argument("--verbose", action="store_true", help="print SB3's table as well as the progress bar")
+    command.add_argument("--verbose", action="store_true", help="print SB3's table, too")
+    command.add_argument("--tensorboard", action="store_true", help="write a log for TensorBoard into the folder, too")
     command.add_argument(
         "--hyperparams-of",
         metavar="ENV",
@@ -123,11 +130,10 @@ def _add_evaluate(commands: Any) -> None:
         _evaluate,
         "Measure how often a trained agent gets from a random start to a random goal of a maze.",
         "With --adapt, a copy of the agent first learns for so many steps with each goal (few-shot), also from the\n"
-        "experience.zip beside AGENT.zip.\n\n"
-        "example:\n  sb3-skillgraph evaluate runs/umaze/agent.zip --env SkillGraph/PointMazeUMaze-v0 --pairs 100",
+        "experience.zip of the run.\n\n"
+        "example:\n  sb3-skillgraph evaluate runs/umaze --pairs 100",
     )
-    command.add_argument("agent", type=Path, metavar="AGENT.zip", help="what train saved")
-    command.add_argument("--env", required=True, metavar="ENV", help="environment id")
+    _add_agent(command)
     command.add_argument("--pairs", type=positive, default=100, help="pairs of start and goal (default: 100)")
     command.add_argument("--adapt", type=positive, default=0, metavar="STEPS", help="steps of adaptation per pair")
     command.add_argument("--straight-on", action="store_true", help="without plans: the walker goes straight on to every goal")
@@ -142,10 +148,9 @@ def _add_plot(commands: Any) -> None:
         _plot,
         "Draw an agent's skill graph, and one plan as it is executed.",
         "OUT receives skill_graph.png and plan.png; --seed chooses start and goal of the plan.\n\n"
-        "example:\n  sb3-skillgraph plot runs/umaze/agent.zip --env SkillGraph/PointMazeUMaze-v0 --out runs/umaze",
+        "example:\n  sb3-skillgraph plot runs/umaze --out runs/umaze",
     )
-    command.add_argument("agent", type=Path, metavar="AGENT.zip", help="what train saved")
-    command.add_argument("--env", required=True, metavar="ENV", help="environment id")
+    _add_agent(command)
     command.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the pictures")
     _add_env_kwargs(command)
 
@@ -173,35 +178,42 @@ def _train(args: argparse.Namespace) -> int:
     _check_env_id(args.env)
     out = args.out or Path("runs") / f"{args.env.rpartition('/')[2]}-seed{args.seed}"
     with for_people():
-        if (out / AGENT).exists() and not is_unfinished(out):
-            raise UserError(f"{out} holds an agent already; give another folder with --out, or remove it.")
         given = check_hyperparams(dict(args.hyperparams), "--hyperparams")
         recommended = load_hyperparams(args.hyperparams_of or args.env, required=bool(args.hyperparams_of))
         hyperparams = {**recommended, **given}
     n_timesteps = int(hyperparams.pop("n_timesteps"))
     env_kwargs, steps = dict(args.env_kwargs), args.steps or n_timesteps
-    train(args.env, env_kwargs, hyperparams, steps, args.seed, out, args.n_envs, args.device, args.verbose)
+    with for_people():
+        if (out / AGENT).exists() and not is_unfinished(out) and not (out / CONFIG).exists():
+            raise UserError(f"{out} holds an agent already; give another folder with --out, or remove it.")
+        if (out / AGENT).exists() and not is_unfinished(out) and steps <= run_config(out)["steps"]:
+            raise UserError(
+                f"{out} holds an agent already, of {run_config(out)['steps']} steps: give more --steps to train it further, "
+                "another folder with --out, or remove it."
+            )
+    given_log = hyperparams.pop("tensorboard_log", None)
+    tensorboard = args.tensorboard or given_log is not None
+    train(args.env, env_kwargs, hyperparams, steps, args.seed, out, args.n_envs, args.device, args.verbose, tensorboard)
     return 0
 
 
 def _evaluate(args: argparse.Namespace) -> int:
-    env_kwargs = dict(args.env_kwargs)
-    env = _make_env(args.env, env_kwargs)
+    path, env_id, env_kwargs = _find_run(args)
+    env = _make_env(env_id, env_kwargs)
     try:
-        agent = _load(args.agent, env)
+        agent = _load(path, env)
         if args.adapt:
-            _load_experience(agent, args.agent.with_name(EXPERIENCE))
+            _load_experience(agent, path.with_name(EXPERIENCE))
         if args.straight_on and args.adapt:
             raise UserError("--straight-on and --adapt do not go together: only the agent itself adapts.")
         tested = StraightOn(agent) if args.straight_on else agent
-        result = evaluate_pairs(
-            tested, args.env, env_kwargs=env_kwargs, n_pairs=args.pairs, seed=args.seed, adapt_timesteps=args.adapt
-        )
+        drawn = dict(n_pairs=args.pairs, seed=args.seed, adapt_timesteps=args.adapt)
+        result = evaluate_pairs(tested, env_id, env_kwargs=env_kwargs, progress_bar=True, **drawn)
     except NoPairsError as error:
         raise UserError(str(error)) from error
     finally:
         env.close()
-    _print_table(args.env, {str(args.agent): result})
+    _print_table(env_id, {str(args.agent): result})
     if args.out is not None:
         write_json(args.out, _as_plain(result))
         print(f"every pair is in {args.out}")
@@ -209,9 +221,10 @@ def _evaluate(args: argparse.Namespace) -> int:
 
 
 def _plot(args: argparse.Namespace) -> int:
-    env = _make_env(args.env, dict(args.env_kwargs))
+    path, env_id, env_kwargs = _find_run(args)
+    env = _make_env(env_id, env_kwargs)
     try:
-        agent = _load(args.agent, env)
+        agent = _load(path, env)
         env.reset(seed=args.seed)
         _draw(agent, env, args.out)
     finally:
@@ -257,6 +270,25 @@ def _check_env_id(env_id: str) -> None:
         hint = did_you_mean(env_id, known) or did_you_mean(env_id.rpartition("/")[2], short)
         reason = f": {error}" if isinstance(error, ImportError) else ""
         raise UserError(f"there is no environment {env_id!r}{reason}{hint}.") from error
+
+
+def _find_run(args: argparse.Namespace) -> tuple[Path, str, dict[str, Any]]:
+    """Return the agent's file, and the environment that was asked for, else that of its run."""
+    path = args.agent / AGENT if args.agent.is_dir() else args.agent
+    config: dict[str, Any] = {}
+    if path.with_name(CONFIG).exists():
+        with for_people():
+            config = run_config(path.parent)
+    asked = dict(args.env_kwargs)
+    if args.env is None:
+        if not config:
+            raise UserError(
+                f"{path} was not left there by train (no {CONFIG} beside it): say with --env in which environment."
+            )
+        return path, str(config["env"]), {**config["env_kwargs"], **asked}
+    if config and (args.env, asked) != (config["env"], config["env_kwargs"]):
+        print(f"note: the agent was trained in {config['env']} {config['env_kwargs'] or ''}")
+    return path, str(args.env), asked
 
 
 def _make_env(env_id: str, env_kwargs: dict[str, Any]) -> gym.Env:

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple, Protocol
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
+from tqdm import tqdm
 
 from sb3_skillgraph.agent import SkillGraphAgent
 from sb3_skillgraph.envs import MazeGeometry
@@ -200,6 +201,7 @@ def evaluate_pairs(
     n_pairs: int = 100,
     seed: int = 0,
     adapt_timesteps: int = 0,
+    progress_bar: bool = False,
 ) -> PairsResult:
     """Measure how often an agent gets from a random start to a random goal.
 
@@ -214,6 +216,7 @@ def evaluate_pairs(
     :param n_pairs: number of pairs
     :param seed: seed of the pairs, and of the environment
     :param adapt_timesteps: environment steps that a copy of the agent learns with each goal before it is tested
+    :param progress_bar: whether to show how far it is
     :return: success rate, interval and every pair
     :raises ValueError: if it is no goal environment, or does not tell when a goal is reached
     :raises NoPairsError: if it is a maze that is too small
@@ -227,7 +230,7 @@ def evaluate_pairs(
             drawn = sample_pairs(made.get_wrapper_attr("geometry"), made.get_wrapper_attr("body_radius"), n_pairs, seed)
         made.reset(seed=seed)
         results = []
-        for start, goal, cells in drawn:
+        for start, goal, cells in tqdm(drawn, unit="pair", disable=not progress_bar):
             tested: Any = agent
             if adapt_timesteps:
                 assert made.spec is not None, "To adapt, give the environment's id."

@@ -15,6 +15,7 @@ from sb3_skillgraph.learning.rollout import Rollout
 from sb3_skillgraph.learning.witness import Witness
 from sb3_skillgraph.memory.store import TransitionStore
 from sb3_skillgraph.metric import Metric
+from sb3_skillgraph.options.average import AveragedPolicy
 from sb3_skillgraph.options.factory import OptionFactory, copy_policy
 from sb3_skillgraph.options.option import Option
 from sb3_skillgraph.options.views import ScaledView
@@ -111,6 +112,7 @@ class Parts:
     witness: Witness
     rollout: Rollout
     skills: dict[str, Option]
+    average: AveragedPolicy
 
     @classmethod
     def build(cls, agent: OffPolicyAlgorithm, spec: GoalSpec, arguments: dict[str, Any]) -> "Parts":
@@ -126,7 +128,8 @@ class Parts:
         model = WalkModel(metric.n_matched)
         planner = Planner(graph, model, horizon(agent.env))
         skills: dict[str, Option] = {}
-        runner = Runner(graph, planner, walker.actor, view, skills)
+        average = AveragedPolicy(walker.learner)  # what predict acts by
+        runner = Runner(graph, planner, average.actor, view, skills)
         missions = Missions(
             graph,
             find_salience(arguments, graph, store, agent),
@@ -135,8 +138,10 @@ class Parts:
             rng,
         )
         witness = Witness(graph, planner.choice_model, agent.n_envs)
-        rollout = common.rollout(runner, missions, witness, arguments)
-        return cls(rng, view_name, factory, store, walker, graph, model, planner, runner, missions, witness, rollout, skills)
+        # Who learns acts by the policy as it is.
+        rollout = common.rollout(Runner(graph, planner, walker.actor, view, skills), missions, witness, arguments)
+        known = (rng, view_name, factory, store, walker, graph, model, planner, runner, missions, witness, rollout)
+        return cls(*known, skills, average)
 
     def options(self) -> Any:
         """Return all options: the walks, one to each event, which share their SB3 model."""
@@ -184,17 +189,25 @@ class Parts:
         rollout.ran, rollout.n_steps = {}, 0
         return earned
 
+    def learned(self, n_updates: int) -> None:
+        """Let the policy that ``predict`` acts by follow the one that learns.
+
+        :param n_updates: how many there were
+        """
+        self.average.follow(n_updates)
+
     def get_state(self) -> dict[str, Any]:
         """Return what has been learned beside the walker's networks, as plain data."""
         skills = [skill_state(skill) for id, skill in self.skills.items() if self.graph.index(id) != NOWHERE]
         learned = {"graph": self.graph.get_state(), "model": self.model.get_state(), "skills": skills}
-        return {"horizon": self.planner.horizon, **learned}
+        return {"horizon": self.planner.horizon, "average": self.average.get_state(), **learned}
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Restore what :meth:`get_state` returned."""
         self.planner.horizon = state["horizon"]
         self.graph.set_state(state["graph"])
         self.model.set_state(state["model"])
+        self.average.set_state(state["average"])
         for spec in state["skills"]:
             skill = self._make_skill(spec["record"]["id"])
             set_skill_state(skill, spec, self.factory.device)
@@ -231,4 +244,4 @@ class Parts:
         :return: actions in the environment's own bounds, shape ``(n, *action_shape)``
         """
         seen = self.runner.view(observation["observation"], observation["achieved_goal"], goals)
-        return self.unscale(self.walker.actor.act(seen))
+        return self.unscale(self.runner.actor.act(seen))

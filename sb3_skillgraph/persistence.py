@@ -173,8 +173,8 @@ def _restore(agent: Any, tree: dict[str, Any], same_envs: bool) -> None:
     """Give a new agent what another one has learned."""
     parts = agent.parts
     parts.walker.learner._n_updates = tree["walker"]
-    parts.set_state(tree)
     agent.set_parameters(tree["parameters"], exact_match=True, device=agent.device)
+    parts.set_state(tree)
     progress = tree["progress"]
     for name in _COUNTERS:
         setattr(agent, name, progress["counters"][name])

@@ -2,6 +2,9 @@
 
 import csv
 import json
+import signal
+import subprocess
+import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,7 +16,6 @@ from conftest import TOY, differences, state_of, without_clock
 
 from sb3_skillgraph import SkillGraphAgent, cli
 from sb3_skillgraph.baselines import StraightOn
-from sb3_skillgraph.callbacks import SkillGraphProgressBarCallback
 from sb3_skillgraph.envs import _TASKS
 from sb3_skillgraph.evaluation import evaluate_pairs
 from sb3_skillgraph.experiments import training
@@ -47,12 +49,14 @@ def error_line(capsys: Capture, argv: Sequence[str]) -> str:
     return captured.err
 
 
-def interrupt_at(n_steps: int) -> Callable[[SkillGraphProgressBarCallback], bool]:
-    """Stands in for the progress bar's step: Ctrl-C after so many."""
+def interrupt_at(n_steps: int, *, twice: bool = False) -> Callable[[training.Clock], bool]:
+    """Stands in for the clock's step: Ctrl-C after so many."""
 
-    def on_step(bar: SkillGraphProgressBarCallback) -> bool:
-        if bar.num_timesteps == n_steps:
-            raise KeyboardInterrupt
+    def on_step(clock: training.Clock) -> bool:
+        if clock.num_timesteps == n_steps:
+            signal.raise_signal(signal.SIGINT)
+            if twice:
+                signal.raise_signal(signal.SIGINT)
         return True
 
     return on_step
@@ -96,10 +100,10 @@ def test_an_interrupted_run_goes_on_and_comes_to_the_same(
     assert cli.main([*command, str(alone)]) == 0
     assert list(checkpoints(alone)) == []
     with monkeypatch.context() as patch:
-        patch.setattr(SkillGraphProgressBarCallback, "_on_step", interrupt_at(530))
+        patch.setattr(training.Clock, "_on_step", interrupt_at(530, twice=True))
         assert cli.main([*command, str(broken)]) == 130
     assert "the same command goes on after 400 steps" in capsys.readouterr().out
-    assert "unfinished run with other settings" in error_line(capsys, [*command, str(broken), "--seed", "1"])
+    assert "run with other settings" in error_line(capsys, [*command, str(broken), "--seed", "1"])
     assert cli.main([*command, str(broken)]) == 0
     assert "going on after 400 steps" in capsys.readouterr().out
     assert list(checkpoints(broken)) == []
@@ -122,13 +126,13 @@ def test_a_run_broken_off_before_its_first_checkpoint_is_saved_and_begins_anew(
     assert cli.main([*command, str(alone)]) == 0
     capsys.readouterr()
     with monkeypatch.context() as patch:
-        patch.setattr(SkillGraphProgressBarCallback, "_on_step", interrupt_at(120))
+        patch.setattr(training.Clock, "_on_step", interrupt_at(120, twice=True))
         assert cli.main([*command, str(broken)]) == 130
     captured = capsys.readouterr()
     assert "interrupted" in captured.err and "agent.zip" in captured.out
     assert "the same command goes on after 0 steps" in captured.out
     assert SkillGraphAgent.load(broken / "agent.zip").num_timesteps == 120
-    assert "unfinished run with other settings" in error_line(capsys, [*command, str(broken), "--seed", "1"])
+    assert "run with other settings" in error_line(capsys, [*command, str(broken), "--seed", "1"])
     assert cli.main([*command, str(broken)]) == 0
     assert same_agents(alone, broken)
     assert "holds an agent already" in error_line(capsys, [*command, str(broken)])
@@ -151,7 +155,7 @@ def test_what_fails_at_its_first_step_does_not_block_the_folder(tmp_path: Path, 
 
     command = ["train", TOY, "--steps", "50", "--out", str(tmp_path)]
     with monkeypatch.context() as patch:
-        patch.setattr(SkillGraphProgressBarCallback, "_on_training_start", fail)
+        patch.setattr(training.Clock, "_on_training_start", fail)
         with pytest.raises(RuntimeError, match="first step"):
             cli.main(command)
     assert cli.main([*command, "--seed", "1"]) == 0
@@ -168,6 +172,47 @@ def test_training_takes_steps_from_yaml_and_names_the_folder(tmp_path: Path, mon
     assert (seed, out) == (0, Path("runs/AntUMaze-v0-seed0"))
     assert cli.main(["train", TOY, "--hyperparams-of", "SkillGraph/AntUMaze-v0", "--hyperparams", "gamma=0.9"]) == 0
     assert calls[1][0] == TOY and calls[1][2:4] == (hyperparams, steps)
+
+
+def test_ctrl_c_keeps_everything_and_the_run_goes_on_from_there(
+    tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(training, "STOP_EVERY", 50)
+    alone, broken = tmp_path / "alone", tmp_path / "broken"
+    command = ["train", TOY, "--steps", "4e2", "--hyperparams", "learning_starts=100", "--out"]
+    assert cli.main([*command, str(alone)]) == 0
+    assert "400 of 400 steps: " in capsys.readouterr().out
+    with monkeypatch.context() as patch:
+        patch.setattr(training.Clock, "_on_step", interrupt_at(120))
+        assert cli.main([*command, str(broken)]) == 130
+    printed = capsys.readouterr().out
+    assert "stopping soon" in printed and "the same command goes on after 150 steps" in printed
+    assert cli.main([*command, str(broken)]) == 0
+    assert "going on after 150 steps" in capsys.readouterr().out
+    assert same_agents(alone, broken)
+    elapsed = [float(row["time/time_elapsed"]) for row in read_progress(broken)]
+    assert elapsed == sorted(elapsed)
+
+
+def test_a_finished_agent_is_trained_further(tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
+    command = ["train", TOY, "--hyperparams", "learning_starts=50", "--out", str(tmp_path), "--tensorboard", "--steps"]
+    assert cli.main([*command, "200"]) == 0
+    assert list(tmp_path.glob("events.out.tfevents.*"))
+    assert "of 200 steps: give more --steps" in error_line(capsys, [*command, "200"])
+    with monkeypatch.context() as patch:
+        patch.setattr(training.Clock, "_on_step", interrupt_at(230, twice=True))
+        assert cli.main([*command, "300"]) == 130
+    assert cli.main([*command, "300"]) == 0
+    assert capsys.readouterr().out.count("going on after 200 steps") == 2
+    agent = SkillGraphAgent.load(tmp_path / "agent.zip")
+    assert agent.num_timesteps == 300
+    assert checkpoints(tmp_path) == {}
+    assert json.loads((tmp_path / "config.json").read_text())["steps"] == 300
+
+
+def test_the_package_is_the_command_line() -> None:
+    done = subprocess.run([sys.executable, "-m", "sb3_skillgraph", "--version"], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["0.2.0"]
 
 
 # -- mistakes ---------------------------------------------------------------------------------------------------------
@@ -192,7 +237,8 @@ def test_training_takes_steps_from_yaml_and_names_the_folder(tmp_path: Path, mon
         (["train", "SkillGraph/PointMaze-v0"], "maze_map is required"),
         (["evaluate", "nothing.zip", "--env", TOY], "no file"),
         (["plot", "nothing.zip", "--env", TOY, "--out", "x"], "no file"),
-        (["evaluate", "nothing.zip"], "--env"),
+        (["evaluate", "nothing.zip"], "say with --env"),
+        (["train", TOY, "--steps", "1.5"], "whole number"),
         (["dance"], "dance"),
     ],
 )
@@ -234,6 +280,24 @@ def test_evaluate_writes_every_pair(folder: Path, tmp_path: Path, capsys: Captur
     assert all(0.0 < pair["trace"]["promised"] <= 1.0 for pair in result["pairs"])
     printed = capsys.readouterr().out
     assert "95 % interval" in printed and str(out) in "".join(printed.split("\n"))
+
+
+def test_a_run_knows_its_environment(folder: Path, tmp_path: Path, capsys: Capture) -> None:
+    result = tmp_path / "result.json"
+    assert cli.main(["evaluate", str(folder), "--pairs", "2", "--out", str(result)]) == 0
+    captured = capsys.readouterr()
+    assert "trained in" not in captured.out and "2/2" in captured.err  # the progress bar
+    assert all(pair["steps"] <= 50 for pair in json.loads(result.read_text())["pairs"])  # its max_steps, too
+    assert cli.main(["evaluate", str(folder), "--env", TOY, "--pairs", "1"]) == 0
+    assert f"note: the agent was trained in {TOY} {{'max_steps': 50}}" in capsys.readouterr().out
+    assert cli.main(["plot", str(folder), "--out", str(tmp_path)]) == 0
+    assert {path.name for path in tmp_path.iterdir()} >= PICTURES
+
+
+def test_a_damaged_configuration_is_called_so(folder: Path, tmp_path: Path, capsys: Capture) -> None:
+    (tmp_path / "agent.zip").write_bytes((folder / "agent.zip").read_bytes())
+    (tmp_path / "config.json").write_text("{")
+    assert "config.json is damaged" in error_line(capsys, ["evaluate", str(tmp_path)])
 
 
 def test_evaluate_can_do_without_plans(folder: Path, tmp_path: Path, capsys: Capture) -> None:

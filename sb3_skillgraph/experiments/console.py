@@ -9,7 +9,9 @@ from typing import Any
 import gymnasium as gym
 import yaml
 
-_VERSIONS_OF = ("sb3_skillgraph", "stable_baselines3", "torch", "gymnasium", "gymnasium_robotics", "mujoco", "numpy")
+from sb3_skillgraph.version import __version__
+
+_VERSIONS_OF = ("stable_baselines3", "torch", "gymnasium", "gymnasium_robotics", "mujoco", "numpy")
 
 
 class UserError(Exception):
@@ -27,18 +29,18 @@ def for_people() -> Iterator[None]:
 
 def versions() -> dict[str, str]:
     """Return the versions of everything that a run's results may depend on."""
-    return {name: version(name) for name in _VERSIONS_OF}
+    return {"sb3_skillgraph": __version__, **{name: version(name) for name in _VERSIONS_OF}}
 
 
 def positive(text: str) -> int:
-    """Read a positive number, underscores allowed.
+    """Read a positive whole number, with underscores or as ``1e4``.
 
     :param text: what was typed
     """
-    number = int(text.replace("_", ""))
-    if number < 1:
-        raise argparse.ArgumentTypeError(f"must be at least 1, not {number}")
-    return number
+    number = float(text.replace("_", ""))
+    if not number.is_integer() or number < 1:
+        raise argparse.ArgumentTypeError(f"must be a whole number, at least 1, not {text}")
+    return int(number)
 
 
 def assignment(text: str) -> tuple[str, Any]:

@@ -27,6 +27,20 @@ def checkpoints(folder: Path) -> dict[int, Path]:
     return {int(path.name.partition("_")[2]): path for path in found}
 
 
+def run_config(folder: Path) -> dict[str, Any]:
+    """Read what a run was asked to do.
+
+    :param folder: of the run
+    :raises ValueError: if its file is damaged
+    """
+    path = folder / CONFIG
+    try:
+        config: dict[str, Any] = json.loads(path.read_text())
+        return {**config, "steps": int(config["steps"]), "env_kwargs": dict(config["env_kwargs"])}
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{path} is damaged: {error!r}.") from error
+
+
 def is_unfinished(folder: Path) -> bool:
     """Tell whether a folder holds a run that was broken off: it has a checkpoint or, before there was one, too few steps.
 
@@ -38,7 +52,7 @@ def is_unfinished(folder: Path) -> bool:
     if not ((folder / AGENT).exists() and (folder / CONFIG).exists()):
         return False
     n_steps: int = load_tree(folder / AGENT, "agent")["progress"]["counters"]["num_timesteps"]
-    return n_steps < int(json.loads((folder / CONFIG).read_text())["steps"])
+    return bool(n_steps < run_config(folder)["steps"])
 
 
 def stops(begin: int, end: int, every: int) -> list[int]:

@@ -2,13 +2,18 @@
 
 import json
 import shutil
+import signal
 import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.logger import HumanOutputFormat, Logger, configure
+from stable_baselines3.common.logger import HumanOutputFormat, Logger, TensorBoardOutputFormat, configure
 
 from sb3_skillgraph.agent import SkillGraphAgent
 from sb3_skillgraph.callbacks import SkillGraphProgressBarCallback
@@ -22,6 +27,7 @@ from sb3_skillgraph.experiments.run_folder import (
     is_unfinished,
     load_agent,
     read_progress,
+    run_config,
     save_agent,
     stops,
     take_checkpoint,
@@ -29,6 +35,8 @@ from sb3_skillgraph.experiments.run_folder import (
 from sb3_skillgraph.rules import PaperRules
 
 CHECKPOINT_EVERY = 10_000  # environment steps
+STOP_EVERY = 500  # environment steps, after which a run can be stopped: Ctrl-C waits for them
+N_LINES = 10  # of progress, where nobody looks at a bar
 
 
 def train(
@@ -41,10 +49,11 @@ def train(
     n_envs: int = 1,
     device: str = "auto",
     verbose: bool = False,
+    tensorboard: bool = False,
 ) -> SkillGraphAgent:
     """Train an agent, from the last checkpoint in the folder if there is one; that comes to the same as in one go.
 
-    A run that was broken off before its first checkpoint begins anew.
+    A run that was broken off before its first checkpoint begins anew; one that is finished is trained further.
 
     :param env_id: id of the environment
     :param env_kwargs: its keyword arguments
@@ -56,13 +65,16 @@ def train(
     :param n_envs: copies of the environment
     :param device: torch device
     :param verbose: whether to print SB3's table as well as the progress bar
+    :param tensorboard: whether to write a log for TensorBoard, too
     :return: the agent
     :raises UserError: if an argument is refused, or the folder holds a run with other ones
     """
     config = dict(env=env_id, env_kwargs=env_kwargs, steps=steps, seed=seed, n_envs=n_envs, arguments=arguments)
     saved = checkpoints(out)
-    if is_unfinished(out):
-        _check_config(out, config)
+    if (out / CONFIG).exists() and (saved or (out / AGENT).exists()):
+        done = _check_config(out, config)
+        if not is_unfinished(out):
+            saved = {done: out}
     with for_people():
         env = make_vec_env(env_id, n_envs=n_envs, env_kwargs=env_kwargs)
     try:
@@ -72,28 +84,39 @@ def train(
                 agent = load_agent(saved[begin], env, device)
                 fresh = "" if env.has_attr("get_state") else f", at a fresh episode: {env_id} cannot tell its state"
                 print(f"going on after {begin} steps{fresh}")
+                if saved[begin] == out:  # what is trained further must not be lost
+                    take_checkpoint(out, begin, lambda folder: save_agent(agent, folder))
             else:
                 agent = SkillGraphAgent(env=env, seed=seed, **{"device": device, **arguments})
         out.mkdir(parents=True, exist_ok=True)
         write_json(out / CONFIG, {**config, "versions": versions()})
-        agent.set_logger(_logger(out, agent.num_timesteps, verbose))
-        _learn(agent, begin, steps, out)
+        rows = [row for row in read_progress(out) if int(row[STEPS]) <= agent.num_timesteps]
+        agent.set_logger(_logger(out, rows, verbose, tensorboard))
+        elapsed = float(rows[-1].get("time/time_elapsed") or 0.0) if rows else 0.0
+        _learn(agent, begin, steps, out, elapsed)
         return agent
     finally:
         env.close()
 
 
-def _learn(agent: SkillGraphAgent, begin: int, steps: int, out: Path) -> None:
-    bar = SkillGraphProgressBarCallback(steps)
+def _learn(agent: SkillGraphAgent, begin: int, steps: int, out: Path, elapsed: float) -> None:
+    bar = SkillGraphProgressBarCallback(steps) if sys.stdout.isatty() else None
+    callbacks = CallbackList([Clock(elapsed), *([bar] if bar is not None else [])])
     try:
-        for target in stops(begin, steps, CHECKPOINT_EVERY):
-            # By what was asked for: a call of several environments may overshoot, and the next makes up for it.
-            agent.learn(target - begin, callback=bar, reset_num_timesteps=False)
-            begin = target
-            if target < steps:
-                take_checkpoint(out, target, lambda folder: save_agent(agent, folder))
+        with _stopped_politely() as is_asked_to_stop:
+            for target in stops(begin, steps, min(STOP_EVERY, CHECKPOINT_EVERY)):
+                # By what was asked for: a call of several environments may overshoot, and the next makes up for it.
+                agent.learn(target - begin, callback=callbacks, reset_num_timesteps=False)
+                if bar is None and target * N_LINES // steps > begin * N_LINES // steps:
+                    _print_line(agent, steps)
+                begin = target
+                if target < steps and (target % CHECKPOINT_EVERY == 0 or is_asked_to_stop()):
+                    take_checkpoint(out, target, lambda folder: save_agent(agent, folder))
+                if target < steps and is_asked_to_stop():
+                    raise KeyboardInterrupt
     finally:
-        bar.close()
+        if bar is not None:
+            bar.close()
         agent.logger.close()
         if agent.num_timesteps > 0:
             save_agent(agent, out)
@@ -104,9 +127,53 @@ def _learn(agent: SkillGraphAgent, begin: int, steps: int, out: Path) -> None:
         shutil.rmtree(path)
 
 
-def _logger(out: Path, n_steps: int, verbose: bool) -> Logger:
+class Clock(BaseCallback):
+    """Counts time and steps from the beginning of a run, however many calls of ``learn`` it takes.
+
+    :param elapsed: seconds that were spent before
+    """
+
+    def __init__(self, elapsed: float) -> None:
+        super().__init__()
+        self.began = time.time_ns() - int(elapsed * 1e9)
+
+    def _on_training_start(self) -> None:
+        self.model.start_time, self.model._num_timesteps_at_start = self.began, 0
+
+    def _on_step(self) -> bool:
+        return True
+
+
+@contextmanager
+def _stopped_politely() -> Iterator[Callable[[], bool]]:
+    """Wait with Ctrl-C until it is asked for; a second one interrupts at once."""
+    asked: list[int] = []
+
+    def ask(number: int, frame: Any) -> None:
+        if asked:
+            raise KeyboardInterrupt
+        asked.append(number)
+        print("stopping soon, so that the same command can go on from here; Ctrl-C again stops at once", flush=True)
+
+    try:
+        before = signal.signal(signal.SIGINT, ask)
+    except ValueError:  # not in the main thread, where nobody presses Ctrl-C
+        yield lambda: False
+        return
+    try:
+        yield lambda: bool(asked)
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _print_line(agent: SkillGraphAgent, steps: int) -> None:
+    summary = agent.graph_summary()
+    counts = f"{summary['events']} events, {summary['edges']} edges, success {summary['success_rate']:.2f}"
+    print(f"{agent.num_timesteps} of {steps} steps: {counts}", flush=True)
+
+
+def _logger(out: Path, rows: list[dict[str, Any]], verbose: bool, tensorboard: bool) -> Logger:
     """Return a logger whose file begins with the rows of the steps that are done."""
-    rows = [row for row in read_progress(out) if int(row[STEPS]) <= n_steps]
     logger = configure(str(out), ["csv"])
     for row in rows:
         for name, value in row.items():
@@ -115,17 +182,23 @@ def _logger(out: Path, n_steps: int, verbose: bool) -> Logger:
         logger.dump(int(row[STEPS]))
     if verbose:
         logger.output_formats.append(HumanOutputFormat(sys.stdout))
+    if tensorboard:
+        logger.output_formats.append(TensorBoardOutputFormat(str(out)))
     return logger
 
 
-def _check_config(out: Path, config: dict[str, Any]) -> None:
-    before = json.loads((out / CONFIG).read_text())
+def _check_config(out: Path, config: dict[str, Any]) -> int:
+    """Refuse a run with other settings than before, but for more steps; return how many there were to be."""
+    before = run_config(out)
     del before["versions"]
-    if before != json.loads(_as_json(config)):
+    asked = json.loads(_as_json(config))
+    done, more = before.pop("steps"), asked.pop("steps")
+    if before != asked or more < done:
         raise UserError(
-            f"{out} holds an unfinished run with other settings, see its {CONFIG}: give the same ones to go on with it, "
-            "or another folder with --out."
+            f"{out} holds a run with other settings, see its {CONFIG}: give the same ones, and as many steps or more, to go "
+            "on with it, or another folder with --out."
         )
+    return done
 
 
 def write_json(path: Path, document: dict[str, Any]) -> None:

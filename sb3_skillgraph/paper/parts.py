@@ -10,6 +10,7 @@ from sb3_skillgraph.arguments import find_salience, horizon
 from sb3_skillgraph.edges import NOWHERE
 from sb3_skillgraph.goal_env import GoalSpec
 from sb3_skillgraph.metric import Ball
+from sb3_skillgraph.options.average import AveragedPolicy
 from sb3_skillgraph.options.option import Option
 from sb3_skillgraph.paper.chaining import DeepSkillChaining
 from sb3_skillgraph.paper.graph import PaperGraph
@@ -58,7 +59,10 @@ class PaperParts(Parts):
         witness: Any = PaperWitness(graph, chaining, missions, agent.n_envs)
         rollout = common.rollout(runner, missions, witness, arguments)
         known = (rng, view_name, factory, store, walker, graph, model, planner, runner, missions, witness, rollout)
-        return cls(*known, chaining.options, chaining, policy)
+        return cls(*known, chaining.options, AveragedPolicy(walker.learner), chaining, policy)
+
+    def learned(self, n_updates: int) -> None:
+        """Options act by their policies as they are."""
 
     def options(self) -> list[Any]:
         """Return all options, gestating ones too, in the order of their making."""

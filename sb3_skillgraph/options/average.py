@@ -1,0 +1,62 @@
+"""Acting by the mean of a policy over the last of its training."""
+
+import copy
+from typing import Any
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.utils import polyak_update
+
+from sb3_skillgraph.options.numpy_actor import NumpyActor
+
+#: The share of its updates that the mean is about, after so many. Who still learns fast is soon a better walker: on Medium,
+#: with means from the first update on, .99 of the goals were reached after 10 000 steps instead of 1.00.
+SHARE, YOUNG = 0.0125, 10_000
+
+
+class AveragedPolicy:
+    """
+    The exponential mean of an actor's weights (Polyak and Juditsky, 1992).
+
+    What is learned last pulls a policy to and fro; its mean walks the same ways in fewer steps, and ants fall less often.
+
+    :param learner: the SB3 model whose actor it is the mean of
+    """
+
+    def __init__(self, learner: OffPolicyAlgorithm) -> None:
+        self.learner = learner
+        self._mean: BasePolicy = copy.deepcopy(self._now)
+        self.actor = NumpyActor(self._mean)
+
+    @property
+    def _now(self) -> BasePolicy:
+        actor = self.learner.policy.actor
+        assert isinstance(actor, BasePolicy)
+        return actor
+
+    def follow(self, n_updates: int) -> None:
+        """Take in what was learned.
+
+        :param n_updates: updates since this was last called
+        """
+        window = max(SHARE * (self.learner._n_updates - YOUNG), 1.0)
+        weight = 1.0 - (1.0 - 1.0 / window) ** n_updates
+        polyak_update(self._now.parameters(), self._mean.parameters(), weight)
+        polyak_update(self._now.buffers(), self._mean.buffers(), 1.0)
+
+    def restart(self) -> None:
+        """Begin with the actor as it is: it was replaced by another."""
+        self._mean.load_state_dict(self._now.state_dict())
+
+    def get_state(self) -> dict[str, np.ndarray]:
+        """Return the weights."""
+        return {name: tensor.detach().cpu().numpy().copy() for name, tensor in self._mean.state_dict().items()}
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Restore what :meth:`get_state` returned.
+
+        :raises RuntimeError: if they are another network's
+        """
+        self._mean.load_state_dict({name: th.as_tensor(array) for name, array in state.items()})
