@@ -87,7 +87,7 @@ def test_training_leaves_agent_log_and_configuration(folder: Path) -> None:
 
 def test_training_does_not_overwrite_an_agent(folder: Path, capsys: Capture) -> None:
     before = (folder / "agent.zip").read_bytes()
-    assert "holds an agent already" in error_line(capsys, ["train", TOY, "--out", str(folder)])
+    assert "holds a run with other settings" in error_line(capsys, ["train", TOY, "--out", str(folder)])
     assert (folder / "agent.zip").read_bytes() == before
 
 
