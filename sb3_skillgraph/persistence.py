@@ -23,6 +23,7 @@ from sb3_skillgraph.goal_env import refuse_changed_goals
 from sb3_skillgraph.options.learner import OptionDDPG, OptionLearner, OptionTD3
 from sb3_skillgraph.rules import PaperRules
 from sb3_skillgraph.saving import MissingCallable, PathOrFile, known_class, load_tree
+from sb3_skillgraph.schema import check_header, check_learned, check_parameters
 
 for _option_class in (OptionDDPG, OptionTD3):
     known_class(_option_class)
@@ -58,7 +59,7 @@ def _update_path(learner: OffPolicyAlgorithm) -> str:
 def _arguments(agent: Any) -> dict[str, Any]:
     """Return the constructor's arguments; those of SB3 that are read from attributes while learning as they are now."""
     arguments = dict(agent._arguments)
-    for name in ("batch_size", "gamma", "gradient_steps", "learning_starts", "tau", "tensorboard_log", "verbose"):
+    for name in ("batch_size", "gamma", "gradient_steps", "learning_starts", "tau", "verbose"):
         arguments[name] = getattr(agent, name)
     arguments["train_freq"] = (agent.train_freq.frequency, agent.train_freq.unit.value)
     arguments["event_radius"] = agent.metric.get_state()
@@ -118,6 +119,7 @@ def load(cls: Any, path: PathOrFile, env: Any, device: Any, given: dict[str, Any
     :raises TypeError: if there is no such argument
     """
     tree = load_tree(path, "agent")
+    check_header(tree, cls)
     unknown = set(given) - set(signature(cls.__init__).parameters)
     if unknown:
         raise TypeError(f"{cls.__name__} has no argument {sorted(unknown)[0]!r}.")
@@ -130,7 +132,8 @@ def load(cls: Any, path: PathOrFile, env: Any, device: Any, given: dict[str, Any
 
 
 def _build(cls: Any, tree: dict[str, Any], env: Any, device: Any, given: dict[str, Any], force_reset: bool) -> Any:
-    arguments = {"policy": "MultiInputPolicy", **tree["arguments"], "device": device}
+    # Nothing in a file decides where anything is written.
+    arguments = {"policy": "MultiInputPolicy", **tree["arguments"], "device": device, "tensorboard_log": None}
     if arguments.get("rules") is not None:
         arguments["rules"] = PaperRules(**arguments["rules"])
     arguments.update(given)
@@ -148,6 +151,7 @@ def _build(cls: Any, tree: dict[str, Any], env: Any, device: Any, given: dict[st
     if isinstance(noise, VectorizedActionNoise) and noise.n_envs != agent.n_envs:
         agent.action_noise = noise.base_noise
     agent._setup_model()
+    check_learned(agent, tree)
     _restore(agent, tree, same_envs=agent.n_envs == tree["n_envs"] and not force_reset)
     agent._loaded = tree["update_path"]
     return agent
@@ -184,13 +188,24 @@ def _restore(agent: Any, tree: dict[str, Any], same_envs: bool) -> None:
     if progress["salience"] is not None:
         parts.missions.salience.set_state(progress["salience"])
     parts.rng.bit_generator.state = progress["rng"]
-    generators = progress["global_generators"]
-    random.setstate(tuple(generators["python"]))
-    np.random.set_state(generators["numpy"])  # noqa: NPY002
-    th.set_rng_state(generators["torch"])
     parts.rollout.set_state(progress["rollout"], same_envs)
     if same_envs:
         agent._env_snapshot = progress["environments"]
+    _set_generators(progress["global_generators"])
+
+
+def _set_generators(state: dict[str, Any]) -> None:
+    """Set the generators of the process; all of them, or none."""
+    before = random.getstate(), np.random.get_state(), th.get_rng_state()  # noqa: NPY002
+    try:
+        random.setstate(tuple(state["python"]))
+        np.random.set_state(state["numpy"])  # noqa: NPY002
+        th.set_rng_state(state["torch"])
+    except Exception:
+        random.setstate(before[0])
+        np.random.set_state(before[1])  # noqa: NPY002
+        th.set_rng_state(before[2])
+        raise
 
 
 def restore_env(agent: Any) -> bool:
@@ -276,6 +291,7 @@ def load_parameters(learner: OffPolicyAlgorithm, tree: dict[str, Any], exact_mat
     """
     before = deepcopy(parameters(learner))
     try:
+        check_parameters(learner, tree["parameters"])
         set_parameters(learner, tree["parameters"], exact_match, device)
     except UNFIT as error:
         set_parameters(learner, before, True, device)

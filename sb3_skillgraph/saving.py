@@ -6,6 +6,7 @@ fixed list and are stored by name; of any other callable only the name is stored
 
 import io
 import json
+import math
 import os
 import pathlib
 import tempfile
@@ -90,22 +91,30 @@ class _Encoder:
         return [dtype, start, list(array.shape)]
 
 
-def _decode(tree: Any, arrays: dict[str, np.ndarray]) -> Any:
+def _decode(tree: Any, arrays: dict[str, np.ndarray], left: dict[str, int]) -> Any:
+    """Return the tree that was encoded.
+
+    :param arrays: by their dtypes
+    :param left: how much of each has not been read: every array is its own part
+    """
     if isinstance(tree, list):
-        return [_decode(item, arrays) for item in tree]
+        return [_decode(item, arrays, left) for item in tree]
     if not isinstance(tree, dict):
         return tree
     if len(tree) == 1:
         ((key, value),) = tree.items()
         if key in ("__array__", "__tensor__"):
             dtype, start, shape = value
-            size = int(np.prod(shape, dtype=np.int64))
+            size = math.prod(shape)
+            left[dtype] -= size
+            if left[dtype] < 0 or not 0 <= start <= len(arrays[dtype]) - size:
+                raise ValueError("it speaks of more numbers than it holds")
             array = arrays[dtype][start : start + size].reshape(shape).copy()
             return th.from_numpy(array) if key == "__tensor__" else array
         if key == "__tuple__":
-            return tuple(_decode(item, arrays) for item in value)
+            return tuple(_decode(item, arrays, left) for item in value)
         if key == "__pairs__":
-            return {_decode(k, arrays): _decode(v, arrays) for k, v in value}
+            return {_decode(k, arrays, left): _decode(v, arrays, left) for k, v in value}
         if key == "__class__":
             return _CLASSES[value]
         if key == "__callable__":
@@ -115,9 +124,9 @@ def _decode(tree: Any, arrays: dict[str, np.ndarray]) -> Any:
             if _CLASSES.get(name) not in _NOISES:
                 raise ValueError(f"it names an object of unknown class {name!r}")
             restored: Any = object.__new__(_CLASSES[name])
-            vars(restored).update(_decode(attributes, arrays))
+            vars(restored).update(_decode(attributes, arrays, left))
             return restored
-    return {key: _decode(value, arrays) for key, value in tree.items()}
+    return {key: _decode(value, arrays, left) for key, value in tree.items()}
 
 
 def save_tree(path: PathOrFile, kind: str, tree: dict[str, Any], suffix: str = ".zip") -> None:
@@ -190,6 +199,7 @@ def load_tree(path: PathOrFile, kind: str, suffix: str = ".zip") -> dict[str, An
 def _read(archive: zipfile.ZipFile, kind: str) -> dict[str, Any]:
     if "agent.json" not in archive.namelist():
         raise ValueError("it holds no agent.json")
+    _check_sizes(archive)
     document = json.loads(archive.read("agent.json"))
     if document["schema"] > SCHEMA:
         raise ValueError(
@@ -207,7 +217,29 @@ def _read(archive: zipfile.ZipFile, kind: str) -> dict[str, Any]:
     for name in archive.namelist():
         if name.endswith(".npy"):
             with archive.open(name) as member:
-                array = np.lib.format.read_array(member, allow_pickle=False)
-                member.read()  # to the end, so that zipfile checks the CRC
+                array = _read_array(io.BytesIO(member.read()))
             arrays[array.dtype.str] = array
-    return _decode(document["tree"], arrays)
+    left = {dtype: array.size for dtype, array in arrays.items()}
+    return _decode(document["tree"], arrays, left)
+
+
+def _check_sizes(archive: zipfile.ZipFile) -> None:
+    """See that nothing grows when it is read: members are stored as they are, and no longer together than the file."""
+    assert archive.fp is not None
+    infos = archive.infolist()
+    if any(info.compress_type != zipfile.ZIP_STORED for info in infos):
+        raise ValueError("its members are compressed")
+    archive.fp.seek(0, os.SEEK_END)
+    if len({info.filename for info in infos}) < len(infos) or sum(info.file_size for info in infos) > archive.fp.tell():
+        raise ValueError("its members are longer than the file, or have the same name")
+
+
+def _read_array(file: io.BytesIO) -> np.ndarray:
+    """Read an array whose header promises what there is."""
+    version = np.lib.format.read_magic(file)
+    read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, _, dtype = read_header(file)
+    if math.prod(shape) * dtype.itemsize != len(file.getvalue()) - file.tell():
+        raise ValueError(f"an array's header promises the shape {shape}, but there is something else")
+    file.seek(0)
+    return np.lib.format.read_array(file, allow_pickle=False)

@@ -646,7 +646,7 @@ def test_ctrl_c_while_a_step_is_being_stored(where: str, monkeypatch: pytest.Mon
     env = Recorder(gym.make(TOY, max_steps=60))
     agent = new_agent(env, learning_starts=1000)  # updates are no part of storing
     part, name = where.split(".")
-    owner = getattr(agent.parts, part)
+    owner = agent.parts.rollout.runner if part == "runner" else getattr(agent.parts, part)
     method = getattr(owner, name)
 
     def pressed(*arguments: Any, **kwargs: Any) -> Any:

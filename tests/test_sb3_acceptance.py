@@ -489,7 +489,7 @@ def test_stacked_goals_are_refused() -> None:
 
 def test_attributes_changed_after_construction_count_and_are_saved() -> None:
     agent = small()
-    agent.gamma, agent.tau, agent.batch_size, agent.tensorboard_log = 0.9, 0.1, 8, None
+    agent.gamma, agent.tau, agent.batch_size = 0.9, 0.1, 8
     agent.train_freq = TrainFreq(4, TrainFrequencyUnit.STEP)
     agent.learn(100)
     learner = agent.parts.walker.learner

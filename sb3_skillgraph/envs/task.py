@@ -35,8 +35,11 @@ def decode_rng(rng: np.random.Generator, words: NDArray[np.uint64]) -> None:
 
     :param rng: a generator over PCG64; it is changed in place
     :param words: the state, shape (6,)
+    :raises ValueError: if no generator has such a state
     """
     state_high, state_low, inc_high, inc_low, has_uint32, uinteger = (int(word) for word in words)
+    if inc_low % 2 == 0:
+        raise ValueError("the state has a generator with an even increment, which may draw the same for ever")
     rng.bit_generator.state = {
         "bit_generator": "PCG64",
         "state": {"state": state_high << 64 | state_low, "inc": inc_high << 64 | inc_low},
@@ -171,7 +174,8 @@ class GoalTask(gym.Env[Any, NDArray[np.float32]]):
         # Plain floats: several times faster than NumPy on two numbers, and the same rounding as compute_reward.
         x, y = observation["achieved_goal"].tolist()
         goal_x, goal_y = self.goal.tolist()
-        return math.sqrt((x - goal_x) ** 2 + (y - goal_y) ** 2) <= self.success_radius
+        dx, dy = x - goal_x, y - goal_y
+        return math.sqrt(dx * dx + dy * dy) <= self.success_radius
 
     def _make_info(self, success: bool) -> dict[str, Any]:
         self._has_succeeded = self._has_succeeded or success

@@ -184,6 +184,9 @@ class TransitionStore:
                     f"The stored replay buffer has {name} of shape {stored}, this agent's environment gives {own}."
                 )
         self._check_rows(state)
+        for name in _COLUMNS:
+            if not np.isfinite(state["columns"][name]).all():
+                raise ValueError(f"The {name} of the stored replay buffer holds NaN or inf.")
         self.total = int(state["total"])
         at = np.arange(self.oldest, self.total) % self.capacity
         for name in _COLUMNS:

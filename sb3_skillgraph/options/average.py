@@ -44,7 +44,8 @@ class AveragedPolicy:
         window = max(SHARE * (self.learner._n_updates - YOUNG), 1.0)
         weight = 1.0 - (1.0 - 1.0 / window) ** n_updates
         polyak_update(self._now.parameters(), self._mean.parameters(), weight)
-        polyak_update(self._now.buffers(), self._mean.buffers(), 1.0)
+        for now, mean in zip(self._now.buffers(), self._mean.buffers(), strict=True):  # counts, running means
+            mean.copy_(now)
 
     def restart(self) -> None:
         """Begin with the actor as it is: it was replaced by another."""

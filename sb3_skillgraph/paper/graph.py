@@ -39,9 +39,9 @@ class PaperGraph(SkillGraph):
     :param walk_steps: environment steps that the pairs of states lie apart at most from which DCO learns
     """
 
-    def __init__(self, goal_dim: int, metric: Metric, walk_steps: int = 40) -> None:
+    def __init__(self, goal_dim: int, metric: Metric | float, walk_steps: int = 40) -> None:
         super().__init__(goal_dim, metric, max_events=2**31, walk_steps=walk_steps)
-        self.cover_radius = metric.radius
+        self.cover_radius = self.metric.radius
         self.options: dict[str, Option] = {}
         self.triggers: dict[str, deque[np.ndarray]] = {}
         self._digraph = networkx.DiGraph()
