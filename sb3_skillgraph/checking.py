@@ -1,7 +1,7 @@
 """What may stand in a file: small checks that are put together into schemas; each names the place that is wrong."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch as th
@@ -12,6 +12,8 @@ Check = Callable[[Any, str], None]
 MOST = 2**53
 #: Numbers beyond which nobody measures: their squares must fit a float32.
 HUGE = 1e15
+#: Numbers of a network beyond which its first products are infinite, and moments of their gradients.
+LARGEST_WEIGHT, LARGEST_GRADIENT = 1e5, 1e12
 
 
 def refuse(where: str, wanted: str, value: Any) -> None:
@@ -148,13 +150,6 @@ def anything(value: Any, where: str) -> None:
 # -- networks ---------------------------------------------------------------------------------------------------------
 
 
-class Limits(NamedTuple):
-    """How large the numbers of a network may be: beyond them its first products are infinite."""
-
-    weights: float = 1e5
-    gradients: float = 1e12
-
-
 def tensor(shape: tuple[int, ...], low: float, high: float) -> Check:
     """Check a tensor, or an array, of finite numbers."""
 
@@ -165,7 +160,7 @@ def tensor(shape: tuple[int, ...], low: float, high: float) -> Check:
     return check
 
 
-def state_dict(like: dict[str, Any], limit: float = Limits().weights) -> Check:
+def state_dict(like: dict[str, Any], limit: float = LARGEST_WEIGHT) -> Check:
     """Check a network's tensors.
 
     :param like: those of a network of the same kind
@@ -181,7 +176,7 @@ def optimizer_state(optimizer: th.optim.Optimizer) -> Check:
     """
     shapes = [tuple(parameter.shape) for group in optimizer.param_groups for parameter in group["params"]]
     groups = optimizer.state_dict()["param_groups"]
-    limit = Limits().gradients
+    limit = LARGEST_GRADIENT
 
     def check_moment(name: str, shape: tuple[int, ...]) -> Check:
         low, high = (0.0, limit**2) if name in ("exp_avg_sq", "max_exp_avg_sq", "square_avg", "step") else (-limit, limit)

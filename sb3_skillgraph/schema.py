@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import torch as th
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.save_util import recursive_getattr
 
 from sb3_skillgraph.checking import (
     HUGE,
@@ -118,15 +119,11 @@ def check_parameters(learner: OffPolicyAlgorithm, given: Any) -> None:
     """
     own = learner.get_parameters()
     entries(True, **dict.fromkeys(own, anything))(given, "parameters")
-    names = {name: getattr(learner, name.partition(".")[0], None) for name in own}
     for name, value in own.items():
-        optimizer = getattr(names[name], "optimizer", None) if name.endswith(".optimizer") else None
-        if name.endswith("optimizer") and optimizer is None:
-            optimizer = getattr(learner, name, None)
-        check = optimizer_state(optimizer) if isinstance(optimizer, th.optim.Optimizer) else state_dict(value)
+        holder = recursive_getattr(learner, name)  # as SB3 finds them: "actor.optimizer"
+        check = optimizer_state(holder) if isinstance(holder, th.optim.Optimizer) else state_dict(value)
         check(given[name], f"parameters/{name}")
-    variables = given.get("variables", {})
-    _finite(variables, "parameters/variables")
+    _finite(given.get("variables", {}), "parameters/variables")
 
 
 def _check_noise(agent: Any) -> None:
