@@ -84,7 +84,7 @@ class Sinks(gym.Wrapper):
 
 
 def test_a_baseline_is_paid_as_options_are_paid() -> None:
-    task = OptionTask(Sinks(toy()), goal_rule(Ball(0.45), gamma=0.9, shaping=2.0))
+    task = OptionTask(Sinks(toy()), goal_rule(Ball(0.45), gamma=0.9, shaping=0.9))  # for each radius: 2 for each cell
     goal = np.array([1.0, 1.0])
     before = task.reset(seed=0, options={"start": [-1.0, 1.0], "goal": goal})[0]["achieved_goal"]
     for n_steps in (1, 2, 3):

@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 
 from sb3_skillgraph.graph import SkillGraph
 from sb3_skillgraph.learning.salience import MARGIN, FrontierSalience, RandomSalience, box_around
+from sb3_skillgraph.metric import Ball
 
 RADIUS = 0.5
 
@@ -25,7 +26,7 @@ def test_frontier_proposes_points_in_the_box_around_what_was_visited(seed: int, 
     rng = np.random.default_rng(seed)
     centers = rng.normal(0.0, 5.0, (n_events, goal_dim))
     salience = FrontierSalience(graph_of(*map(tuple, centers)))
-    lower, upper = box_around(centers, RADIUS)
+    lower, upper = box_around(centers, Ball(RADIUS))
     np.testing.assert_allclose(lower, centers.min(axis=0) - MARGIN * RADIUS)
     np.testing.assert_allclose(upper, centers.max(axis=0) + MARGIN * RADIUS)
     for _ in range(20):

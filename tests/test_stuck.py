@@ -92,14 +92,15 @@ def test_the_episode_is_given_up(n_envs: int, tmp_path: Any) -> None:
 def test_no_event_lies_in_the_pit_and_runs_into_it_land_nowhere(monkeypatch: pytest.MonkeyPatch) -> None:
     agent = new_agent(pit_env())
     runs: list[tuple[Run, bool]] = []
-    advance = agent.parts.runner.advance
+    runner = agent.parts.rollout.runner
+    advance = runner.advance
 
     def noted(state: RunnerState, points: np.ndarray, stuck: Any = None) -> Any:
         state, ended = advance(state, points, stuck)
         runs.extend((run, bool(in_pit(points)[run.env])) for run in ended)
         return state, ended
 
-    monkeypatch.setattr(agent.parts.runner, "advance", noted)
+    monkeypatch.setattr(runner, "advance", noted)
     agent.learn(2500, log_interval=None)
     assert agent.parts.rollout.n_stuck > 3
     assert not in_pit(agent.graph.centers).any()
