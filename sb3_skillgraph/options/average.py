@@ -20,7 +20,7 @@ class AveragedPolicy:
     """
     The exponential mean of an actor's weights (Polyak and Juditsky, 1992).
 
-    What is learned last pulls a policy to and fro; its mean walks the same ways in fewer steps, and ants fall less often.
+    What is learned last pulls a policy to and fro; its mean walks the same ways in fewer steps.
 
     :param learner: the SB3 model whose actor it is the mean of
     """
