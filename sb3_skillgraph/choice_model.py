@@ -139,7 +139,6 @@ class ChoiceModel:
         graph is considered only where there is no shorter one.
         """
         graph, vertex = self.graph, len(self.graph.events)
-        distance = graph.travel(goal)
         home = graph.locate(goal)
         near = np.argsort(graph.distances(goal), kind="stable")
         if not everywhere:
@@ -147,7 +146,7 @@ class ChoiceModel:
         if home == NOWHERE:
             guessed = self._guessed(near, near, vertex, graph.centers[near], goal, np.zeros(len(near)), runs)
             return guessed if everywhere else self._short(guessed, least=1)
-        beside = self._beside(self._edges(graph.edges.target == home, replaced, tried), home, distance, runs)
+        beside = self._beside(self._edges(graph.edges.target == home, replaced, tried), home, goal, runs)
         near = near[~np.isin(near, beside.source)]
         seen = (near == home).astype(np.float64)  # somebody was near the goal, in its event
         guessed = self._guessed(near, near, vertex, graph.centers[near], goal, seen, runs)
@@ -164,17 +163,17 @@ class ChoiceModel:
         rank = np.argsort(np.argsort(guessed.steps, kind="stable"), kind="stable")
         return guessed.take(np.flatnonzero((guessed.steps <= self.graph.walk_steps) | (rank < least)))
 
-    def _beside(self, walks: Choices, home: int, distance: np.ndarray, runs: Runs) -> Choices:
+    def _beside(self, walks: Choices, home: int, goal: np.ndarray, runs: Runs) -> Choices:
         """Return walks to the goal for the walks to its event.
 
         :param walks: to the event
         :param home: index of the event
-        :param distance: from all events to the goal, in radii
+        :param goal: shape ``(goal_dim,)``
         :param runs: of the episode
         """
-        vertex, centers = len(self.graph.events), self.graph.centers
-        between = np.maximum(self.graph.metric.travel(centers[walks.source], centers[home]), 1e-9)
-        stretch = np.clip(distance[walks.source] / between, 0.5, 2.0)
+        vertex, centers, metric = len(self.graph.events), self.graph.centers, self.graph.metric
+        between = np.maximum(metric.travel(centers[walks.source], centers[home]), 1e-9)
+        stretch = np.clip(metric.travel(centers[walks.source], goal) / between, 0.5, 2.0)
         beside = walks._replace(
             target=np.full(len(walks.target), vertex),
             guess=BESIDE * walks.guess,

@@ -184,17 +184,24 @@ def _train(args: argparse.Namespace) -> int:
     n_timesteps = int(hyperparams.pop("n_timesteps"))
     env_kwargs, steps = dict(args.env_kwargs), args.steps or n_timesteps
     with for_people():
-        if (out / AGENT).exists() and not is_unfinished(out) and not (out / CONFIG).exists():
-            raise UserError(f"{out} holds an agent already; give another folder with --out, or remove it.")
-        if (out / AGENT).exists() and not is_unfinished(out) and steps <= run_config(out)["steps"]:
-            raise UserError(
-                f"{out} holds an agent already, of {run_config(out)['steps']} steps: give more --steps to train it further, "
-                "another folder with --out, or remove it."
-            )
+        if (out / AGENT).exists() and not is_unfinished(out):
+            _refuse_finished(out, steps)
     given_log = hyperparams.pop("tensorboard_log", None)
     tensorboard = args.tensorboard or given_log is not None
     train(args.env, env_kwargs, hyperparams, steps, args.seed, out, args.n_envs, args.device, args.verbose, tensorboard)
     return 0
+
+
+def _refuse_finished(out: Path, steps: int) -> None:
+    """Refuse to train a finished agent that is not known, or for no more steps than it has had."""
+    if not (out / CONFIG).exists():
+        raise UserError(f"{out} holds an agent already; give another folder with --out, or remove it.")
+    done = run_config(out)["steps"]
+    if steps <= done:
+        raise UserError(
+            f"{out} holds an agent already, of {done} steps: give more --steps to train it further, another folder with "
+            "--out, or remove it."
+        )
 
 
 def _evaluate(args: argparse.Namespace) -> int:

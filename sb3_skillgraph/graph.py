@@ -98,10 +98,6 @@ class SkillGraph:
         """Return how far the events are from a point, shape ``(n_events,)``, in the metric's unit."""
         return self.metric.distance(self.centers, point)
 
-    def travel(self, point: np.ndarray) -> np.ndarray:
-        """Return how far it is to go from a point to the events, or back, shape ``(n_events,)``, in radii."""
-        return self.metric.travel(self.centers, point)
-
     def add_event(self, center: np.ndarray, *, salient: bool) -> int:
         """Add an event; whoever adds sees to it that there is room (see :meth:`coarsen`).
 

@@ -90,9 +90,8 @@ def check_learned(agent: Any, tree: dict[str, Any]) -> None:
     """
     check_parameters(agent.parts.walker.learner, tree["parameters"])
     _check_noise(agent)
-    _finite(tree["progress"], "progress")
+    _finite({name: value for name, value in tree.items() if name not in ("arguments", "spaces", "parameters")}, "the file")
     if agent.rules is not None:
-        _finite({name: value for name, value in tree.items() if name not in ("arguments", "spaces", "parameters")}, "the file")
         return
     n_events = len(tree["graph"]["events"]) if isinstance(tree.get("graph"), dict) else 0
     spec, metric = agent._spec, agent.metric
@@ -106,8 +105,6 @@ def check_learned(agent: Any, tree: dict[str, Any]) -> None:
         progress=_progress(tree["n_envs"], spec, n_events, metric.n_matched, agent),
     )(tree, "the file")
     _check_edges(tree["graph"], n_events)
-    for i, skill in enumerate(tree["skills"]):
-        _finite(skill["record"], f"skills/{i}/record")
 
 
 def check_parameters(learner: OffPolicyAlgorithm, given: Any) -> None:

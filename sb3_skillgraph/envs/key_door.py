@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 from gymnasium import spaces
+from gymnasium.utils import EzPickle
 from numpy.typing import NDArray
 
 from sb3_skillgraph.envs.maze_geometry import MazeGeometry, MazeMap
@@ -65,7 +66,7 @@ class PointKeyDoorEnv(PointMazeEnv):
         position = spaces.Box(-np.inf, np.inf, (4,), np.float64)
         observation = spaces.Box(-np.inf, np.inf, (6,), np.float64)
         self.observation_space = spaces.Dict(observation=observation, achieved_goal=position, desired_goal=position)
-        self._ezpickle_args = (maze_map, render_mode, success_radius, max_steps, terminate_on_success)
+        EzPickle.__init__(self, maze_map, render_mode, success_radius, max_steps, terminate_on_success)
 
     # -- key and door -------------------------------------------------------------------------------------------------
 
