@@ -75,7 +75,9 @@ def find(env_id: str) -> None:
     if package:
         importlib.import_module(package)
     elif name not in gym.registry:
-        import gymnasium_robotics  # when it is asked for: it takes a while to import
+        # When it is asked for: it takes a while to import; after the module that keeps its import quiet.
+        import sb3_skillgraph.envs.mujoco_mazes  # noqa: F401, I001
+        import gymnasium_robotics
 
         gym.register_envs(gymnasium_robotics)
     gym.spec(name)
