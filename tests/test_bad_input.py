@@ -29,6 +29,7 @@ from conftest import (
     state_in,
     state_of,
 )
+from fuzz import members, packed
 from gymnasium import spaces
 from stable_baselines3 import DDPG
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
@@ -349,13 +350,7 @@ class Bomb:
 
 def with_member(path: Path, name: str, content: bytes) -> bytes:
     """A saved file with one member replaced or added."""
-    file = io.BytesIO()
-    with zipfile.ZipFile(path) as old, zipfile.ZipFile(file, "w") as new:
-        for member in old.namelist():
-            if member != name:
-                new.writestr(member, old.read(member))
-        new.writestr(name, content)
-    return file.getvalue()
+    return packed({**members(path.read_bytes()), name: content})
 
 
 def as_npy(array: np.ndarray) -> bytes:
