@@ -115,7 +115,7 @@ def main() -> None:
         runs.append(run)
         for check in run["checks"]:
             print(json.dumps({"seed": run["seed"], **{k: v for k, v in check.items() if k != "pairs"}}), flush=True)
-        document = {
+        document: dict[str, Any] = {
             "command": "python -m benchmarks.zero_shot " + shlex.join(sys.argv[1:]),
             "version": __version__,
             "success_rate": {
