@@ -28,7 +28,7 @@ from sb3_skillgraph import __version__
 from sb3_skillgraph.baselines import StraightOn, random_walk
 from sb3_skillgraph.envs import MazeGeometry
 from sb3_skillgraph.evaluation import Predictor, run_pair, sample_pairs
-from sb3_skillgraph.experiments.run_folder import CONFIG, checkpoints, load_agent
+from sb3_skillgraph.experiments.run_folder import CONFIG, checkpoints, load_agent, read_json
 
 TOLERANCES = {"0.45 m": 0.45, "0.6 m": 0.6, "0.6 cells": 2.4}
 WALKS = ("pairs", "far", "floor", "straight")
@@ -71,7 +71,7 @@ def visited_share(geometry: MazeGeometry, points: np.ndarray) -> float:
 
 def test_run(folder: pathlib.Path) -> dict[str, Any]:
     """Test the newest checkpoint of a run."""
-    config = json.loads((folder / CONFIG).read_text())
+    config = read_json(folder / CONFIG)
     env = gym.make(config["env_id"], **{"terminate_on_success": True, **config["env_kwargs"]})
     saved = checkpoints(folder)
     if not saved:

@@ -5,7 +5,6 @@ python -m benchmarks.compare_table benchmarks/compare.yml benchmarks/results/com
 
 import argparse
 import csv
-import json
 import math
 import pathlib
 import warnings
@@ -15,7 +14,8 @@ import numpy as np
 from scipy.stats import ttest_ind
 
 from sb3_skillgraph.experiments.plan import load_plan
-from sb3_skillgraph.experiments.runner import DONE, RunStatus, by_method, status
+from sb3_skillgraph.experiments.run_folder import DONE, read_json
+from sb3_skillgraph.experiments.runner import RunStatus, by_method, status
 from sb3_skillgraph.experiments.summary import estimate
 
 # What Figure 5 of the paper shows, and what it leaves open: is it the planning, or hindsight, or events?
@@ -34,7 +34,7 @@ ORDER = [
 
 def steps_to_goals(runs: list[RunStatus], out: pathlib.Path) -> float:
     """Return how many environment steps the goals that were reached took, in the mean; no number if none was."""
-    documents = [json.loads((run.spec.folder(out) / DONE).read_text()) for run in runs]
+    documents = [read_json(run.spec.folder(out) / DONE) for run in runs]
     steps = [pair["steps"] for document in documents for pair in document["pairs"] if pair["success"]]
     return float(np.mean(steps)) if steps else math.nan
 

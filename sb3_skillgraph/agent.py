@@ -518,7 +518,8 @@ class SkillGraphAgent(OffPolicyAlgorithm):
 
         :raises OSError: if the file cannot be written; an old file of that name is then untouched
         """
-        save_tree(path, "agent", persistence.agent_tree(self, set(exclude or ()) - set(include or ())))
+        tree = persistence.agent_tree(self, set(exclude or ()) - set(include or ()))
+        save_tree(path, "agent", tree, by_name=("arguments",))
 
     def save_replay_buffer(self, path: PathOrFile) -> None:
         """

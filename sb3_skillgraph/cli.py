@@ -19,7 +19,7 @@ from sb3_skillgraph.envs import find, geometry_of
 from sb3_skillgraph.evaluation import NoPairsError, PairsResult, Predictor, evaluate_pairs
 from sb3_skillgraph.experiments.commands import add_compare, add_figure, add_status
 from sb3_skillgraph.experiments.console import UserError, assignment, for_people, positive
-from sb3_skillgraph.experiments.run_folder import AGENT, CONFIG, EXPERIENCE, is_unfinished, run_config
+from sb3_skillgraph.experiments.run_folder import AGENT, CONFIG, EXPERIENCE, run_config
 from sb3_skillgraph.experiments.training import train, write_json
 from sb3_skillgraph.hyperparams import check_hyperparams, did_you_mean, load_hyperparams
 from sb3_skillgraph.plotting import plot_plan, plot_skill_graph, run_plan, save_figure
@@ -183,25 +183,10 @@ def _train(args: argparse.Namespace) -> int:
         hyperparams = {**recommended, **given}
     n_timesteps = int(hyperparams.pop("n_timesteps"))
     env_kwargs, steps = dict(args.env_kwargs), args.steps or n_timesteps
-    with for_people():
-        if (out / AGENT).exists() and not is_unfinished(out):
-            _refuse_finished(out, steps)
     given_log = hyperparams.pop("tensorboard_log", None)
     tensorboard = args.tensorboard or given_log is not None
     train(args.env, env_kwargs, hyperparams, steps, args.seed, out, args.n_envs, args.device, args.verbose, tensorboard)
     return 0
-
-
-def _refuse_finished(out: Path, steps: int) -> None:
-    """Refuse to train a finished agent that is not known, or for no more steps than it has had."""
-    if not (out / CONFIG).exists():
-        raise UserError(f"{out} holds an agent already; give another folder with --out, or remove it.")
-    done = run_config(out)["steps"]
-    if steps <= done:
-        raise UserError(
-            f"{out} holds an agent already, of {done} steps: give more --steps to train it further, another folder with "
-            "--out, or remove it."
-        )
 
 
 def _evaluate(args: argparse.Namespace) -> int:

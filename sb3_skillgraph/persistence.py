@@ -4,7 +4,7 @@ import io
 import random
 import warnings
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from copy import deepcopy
 from dataclasses import asdict
 from inspect import signature
@@ -18,11 +18,12 @@ from stable_baselines3.common.noise import VectorizedActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.save_util import recursive_getattr
 from stable_baselines3.common.utils import check_for_correct_spaces
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_skillgraph.goal_env import refuse_changed_goals
 from sb3_skillgraph.options.learner import OptionDDPG, OptionLearner, OptionTD3
 from sb3_skillgraph.rules import PaperRules
-from sb3_skillgraph.saving import MissingCallable, PathOrFile, known_class, load_tree
+from sb3_skillgraph.saving import MissingCallable, PathOrFile, check_encoding, known_class, load_tree
 from sb3_skillgraph.schema import check_header, check_learned, check_parameters
 
 for _option_class in (OptionDDPG, OptionTD3):
@@ -82,7 +83,7 @@ def _progress(agent: Any) -> dict[str, Any]:
         "ep_info_buffer": list(agent.ep_info_buffer or ()),
         "ep_success_buffer": [bool(success) for success in agent.ep_success_buffer or ()],
         "rollout": rollout.get_state(),
-        "salience": salience.get_state() if hasattr(salience, "get_state") else None,
+        "salience": _told("The salience", salience.get_state) if hasattr(salience, "get_state") else None,
         "rng": agent.parts.rng.bit_generator.state if pending is None else pending.rng_state,
         "global_generators": {
             "python": list(random.getstate()),
@@ -93,14 +94,34 @@ def _progress(agent: Any) -> dict[str, Any]:
     }
 
 
+def _told(who: str, get_state: Callable[[], Any]) -> Any:
+    """Return a state that only an exact continuation needs; None, with a warning, if it cannot be had or saved."""
+    try:
+        state = get_state()
+        check_encoding(state, "its state")
+        return state
+    except Exception as error:  # whatever the user's own code, or a worker that has died, raises
+        warnings.warn(
+            f"{who} cannot tell its state ({type(error).__name__}: {error}): all else is saved, but learning will not go on "
+            "exactly where it was.",
+            stacklevel=2,
+        )
+        return None
+
+
 def _snapshot(agent: Any) -> dict[str, Any] | None:
-    """Return the states of the environments; None if they cannot tell them, or moved since the last stored step."""
+    """Return the states of the environments; None if they moved since the last stored step, or cannot tell them."""
     if agent._env_snapshot is not None:
         return agent._env_snapshot  # loaded, and not put to use yet
-    env = agent.env
-    if env is None or agent._last_obs is None or agent.parts.rollout.pending is not None or not env.has_attr("get_state"):
+    if agent.env is None or agent._last_obs is None or agent.parts.rollout.pending is not None:
         return None
-    snapshot = {"states": env.env_method("get_state"), "last_obs": agent._last_obs}
+    return _told("The environment", lambda: _env_states(agent.env, agent._last_obs))
+
+
+def _env_states(env: VecEnv, last_obs: Any) -> dict[str, Any] | None:
+    if not env.has_attr("get_state"):
+        return None
+    snapshot = {"states": env.env_method("get_state"), "last_obs": last_obs}
     if all(env.env_is_wrapped(Monitor)):
         snapshot["monitor_rewards"] = [list(map(float, rewards)) for rewards in env.get_attr("rewards")]
     return snapshot
@@ -353,4 +374,4 @@ def make_space(description: dict[str, Any]) -> spaces.Space:
     if "entries" in description:
         return spaces.Dict({key: make_space(entry) for key, entry in description["entries"].items()})
     low: np.ndarray = description["low"]
-    return spaces.Box(low, description["high"], dtype=low.dtype.type)
+    return spaces.Box(low, description["high"], dtype=low.dtype)

@@ -1,7 +1,8 @@
 """Trees of plain data as one zip: JSON beside ``.npy`` members, nothing that could run code on loading.
 
 A tree is made of None, bool, int, float, str, list, tuple, dict, NumPy arrays and torch tensors. Classes come from a
-fixed list and are stored by name; of any other callable only the name is stored, and loading asks for it again.
+fixed list and are stored by name. Of anything else among an agent's arguments only the name is stored, and loading asks
+for it again; elsewhere it is refused, so that what cannot be read is never written.
 """
 
 import io
@@ -9,8 +10,9 @@ import json
 import math
 import os
 import pathlib
-import tempfile
 import zipfile
+from collections import OrderedDict
+from collections.abc import Collection, Iterable
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -18,6 +20,7 @@ import torch as th
 from stable_baselines3 import DDPG, SAC, TD3
 from stable_baselines3.common import noise
 
+from sb3_skillgraph.files import replaced
 from sb3_skillgraph.version import __version__
 
 SCHEMA = 2
@@ -52,43 +55,67 @@ class MissingCallable:
 
 
 class _Encoder:
-    """Turns a tree into JSON and one array per dtype, into which all arrays of that dtype are strung."""
+    """Turns a tree into JSON and one array per dtype, into which all arrays of that dtype are strung.
 
-    def __init__(self) -> None:
+    :param by_name: entries of the tree in which what has no encoding is stored by its name
+    """
+
+    def __init__(self, by_name: Collection[str] = ()) -> None:
+        self.by_name = by_name
         self.parts: dict[str, list[np.ndarray]] = {}
         self.sizes: dict[str, int] = {}
 
-    def encode(self, tree: Any) -> Any:
-        if tree is None or isinstance(tree, bool | int | float | str):
+    def encode(self, tree: Any, *where: str) -> Any:
+        """Return a tree, or the part of one that stands at some place, as JSON.
+
+        :raises ValueError: naming the place of what could not be read again
+        """
+        kind = type(tree)
+        if tree is None or kind in (bool, int, float, str):
             return tree
-        if isinstance(tree, np.generic):
-            return tree.item()
+        if isinstance(tree, np.generic) and not tree.dtype.hasobject and tree.dtype.names is None:
+            return self.encode(tree.item(), *where)
         if isinstance(tree, th.Tensor):
-            return {"__tensor__": self._array(tree.detach().cpu().numpy())}
-        if isinstance(tree, np.ndarray):
-            return {"__array__": self._array(tree)}
-        if isinstance(tree, tuple):
-            return {"__tuple__": [self.encode(item) for item in tree]}
-        if isinstance(tree, list):
-            return [self.encode(item) for item in tree]
-        if isinstance(tree, dict):
-            if all(isinstance(key, str) and not key.startswith("__") for key in tree):
-                return {key: self.encode(value) for key, value in tree.items()}
-            return {"__pairs__": [[self.encode(key), self.encode(value)] for key, value in tree.items()]}
-        if isinstance(tree, _NOISES):
-            return {"__object__": [type(tree).__name__, self.encode(vars(tree))]}
+            return {"__tensor__": self._array(tree.detach().cpu().numpy(), where)}
+        if kind in (np.ndarray, np.memmap):
+            return {"__array__": self._array(tree, where)}
+        if kind is tuple:
+            return {"__tuple__": self._items(tree, where)}
+        if kind is list:
+            return self._items(tree, where)
+        if kind in (dict, OrderedDict):
+            if all(type(key) is str and not key.startswith("__") for key in tree):
+                return {key: self.encode(value, *where, key) for key, value in tree.items()}
+            return {"__pairs__": [[self.encode(k, *where, "a key"), self.encode(v, *where, str(k))] for k, v in tree.items()]}
+        if kind in _NOISES:
+            return {"__object__": [kind.__name__, self.encode(vars(tree), *where)]}
         if isinstance(tree, type) and _CLASSES.get(tree.__name__) is tree:
             return {"__class__": tree.__name__}
-        return {"__callable__": getattr(tree, "__qualname__", type(tree).__qualname__)}
+        if where and where[0] in self.by_name:
+            return {"__callable__": getattr(tree, "__qualname__", kind.__qualname__)}
+        raise ValueError(f"{'/'.join(where)} cannot be saved: a {kind.__qualname__} has no encoding.")
 
-    def _array(self, array: np.ndarray) -> list[Any]:
+    def _items(self, items: Iterable[Any], where: tuple[str, ...]) -> list[Any]:
+        return [self.encode(item, *where, str(i)) for i, item in enumerate(items)]
+
+    def _array(self, array: np.ndarray, where: tuple[str, ...]) -> list[Any]:
+        if array.dtype.kind not in "biufcSU":
+            raise ValueError(f"{'/'.join(where)} cannot be saved: an array of {array.dtype} has no encoding.")
         dtype = array.dtype.str
-        if array.dtype.hasobject:
-            raise ValueError(f"An array of Python objects cannot be saved: {array!r}")
         start = self.sizes.get(dtype, 0)
         self.parts.setdefault(dtype, []).append(np.ascontiguousarray(array).ravel())
         self.sizes[dtype] = start + array.size
         return [dtype, start, list(array.shape)]
+
+
+def check_encoding(tree: Any, name: str) -> None:
+    """Refuse what could not be read again.
+
+    :param tree: what is to be saved
+    :param name: of it
+    :raises ValueError: naming the place
+    """
+    _Encoder().encode(tree, name)
 
 
 def _decode(tree: Any, arrays: dict[str, np.ndarray], left: dict[str, int]) -> Any:
@@ -129,42 +156,34 @@ def _decode(tree: Any, arrays: dict[str, np.ndarray], left: dict[str, int]) -> A
     return {key: _decode(value, arrays, left) for key, value in tree.items()}
 
 
-def save_tree(path: PathOrFile, kind: str, tree: dict[str, Any], suffix: str = ".zip") -> None:
+def save_tree(path: PathOrFile, kind: str, tree: dict[str, Any], suffix: str = ".zip", by_name: Collection[str] = ()) -> None:
     """Write a tree; a file is written beside its place and then renamed, so that the old one stays until the new is whole.
 
     :param path: path (``suffix`` is added if it has none) or binary file object
     :param kind: what the file holds, checked on loading
     :param tree: the data
     :param suffix: file name ending
-    :raises ValueError: if the tree holds something that is no plain data
+    :param by_name: entries of the tree in which what is no plain data is stored by its name
+    :raises ValueError: naming what is no plain data elsewhere: it could not be read again
     :raises OSError: if the file cannot be written; an old file of that name is then untouched
     """
-    encoder = _Encoder()
+    encoder = _Encoder(by_name)
     document = {"schema": SCHEMA, "kind": kind, "version": __version__, "tree": encoder.encode(tree)}
     if not isinstance(path, str | pathlib.Path):
         _write(path, document, encoder)
         return
     path = pathlib.Path(path)
     path = path.with_name(path.name + suffix) if path.suffix == "" else path
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            _write(file, document, encoder)
-            file.flush()
-            os.fsync(file.fileno())
-        os.chmod(temporary, 0o644)
-        os.replace(temporary, path)
-    except BaseException:
-        pathlib.Path(temporary).unlink(missing_ok=True)
-        raise
+    with replaced(path) as file:
+        _write(file, document, encoder)
 
 
 def _write(file: Any, document: dict[str, Any], encoder: _Encoder) -> None:
     with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
         archive.writestr("agent.json", json.dumps(document))
         for dtype, parts in encoder.parts.items():
-            with archive.open(f"arrays/{dtype[1:]}.npy", "w", force_zip64=True) as member:
+            name = dtype[1:] if dtype[0] != ">" else f"big_endian_{dtype[1:]}"
+            with archive.open(f"arrays/{name}.npy", "w", force_zip64=True) as member:
                 np.lib.format.write_array(member, np.concatenate(parts), allow_pickle=False)
 
 

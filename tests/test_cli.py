@@ -25,7 +25,7 @@ from sb3_skillgraph.options.learner import OptionTD3
 
 Capture = pytest.CaptureFixture[str]
 PICTURES = {"skill_graph.png", "plan.png"}
-TRAINED = {"agent.zip", "experience.zip", "progress.csv", "config.json"}
+TRAINED = {"agent.zip", "experience.zip", "progress.csv", "config.json", "done.json", "lock"}
 
 
 @pytest.fixture(scope="module")

@@ -1,6 +1,5 @@
 """The paper's figures, redrawn from stored runs."""
 
-import json
 from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -13,8 +12,8 @@ from sb3_skillgraph.agent import SkillGraphAgent
 from sb3_skillgraph.baselines import random_walk
 from sb3_skillgraph.envs import MazeGeometry
 from sb3_skillgraph.experiments.plan import RunSpec
-from sb3_skillgraph.experiments.run_folder import STEPS, checkpoints, load_agent, read_progress
-from sb3_skillgraph.experiments.runner import DONE, STRETCH, is_done
+from sb3_skillgraph.experiments.run_folder import DONE, STEPS, checkpoints, load_agent, read_json, read_progress
+from sb3_skillgraph.experiments.runner import STRETCH, is_done
 from sb3_skillgraph.experiments.summary import estimate
 from sb3_skillgraph.learning.dco import learn_fiedler
 from sb3_skillgraph.plotting import paper_figures as draw
@@ -162,7 +161,7 @@ def method_curves(specs: Sequence[RunSpec], out: Path) -> dict[str, draw.Curve]:
         done = [spec for spec in specs if spec.method == method and is_done(spec, out)]
         if not done:
             continue
-        steps = [int(row[STEPS]) for row in read_progress(done[0].folder(out))]
+        steps = [row[STEPS] for row in read_progress(done[0].folder(out))]
         scores = np.array([_scores(spec, spec.folder(out)) for spec in done])
         if len(steps) == 1:  # nothing to learn: the same from the beginning
             steps, scores = [0, *steps], np.repeat(scores, 2, axis=1)
@@ -173,7 +172,7 @@ def method_curves(specs: Sequence[RunSpec], out: Path) -> dict[str, draw.Curve]:
 
 def _scores(spec: RunSpec, folder: Path) -> list[float]:
     scores = [float(row["eval/success_rate"]) for row in read_progress(folder)]
-    pairs = json.loads((folder / DONE).read_text())["pairs"][: spec.pairs]
+    pairs = read_json(folder / DONE)["pairs"][: spec.pairs]
     return [*scores[:-1], float(np.mean([pair["success"] for pair in pairs]))]
 
 
@@ -186,7 +185,7 @@ def practice_curves(specs: Sequence[RunSpec], out: Path) -> dict[str, draw.Curve
     result = {}
     for method in dict.fromkeys(spec.method for spec in specs):
         files = [spec.folder(out) / DONE for spec in specs if spec.method == method and is_done(spec, out)]
-        tests = [json.loads(file.read_text())["test_time"] for file in files]
+        tests = [read_json(file)["test_time"] for file in files]
         if not tests or not tests[0]:
             continue
         scores = np.array([np.mean(pairs, axis=0) for pairs in tests])
@@ -201,7 +200,7 @@ def growth(specs: Sequence[RunSpec], out: Path) -> Axes:
     geometry = _geometry(spec)
     snapshots = [
         draw.GraphSnapshot(plain["steps"], np.array(plain["centers"]), [tuple(link) for link in plain["links"]])
-        for plain in (json.loads(path.read_text()) for path in spec.folder(out).glob("graph_*.json"))
+        for plain in (read_json(path) for path in spec.folder(out).glob("graph_*.json"))
     ]
     snapshots.sort(key=lambda snapshot: snapshot.steps)
     if not snapshots:
@@ -221,7 +220,7 @@ def failure_of_dco(specs: Sequence[RunSpec], out: Path) -> Axes:
     for axes, runs in zip(panels, both, strict=True):
         spec = next((run for run in runs if run.seed == seed), runs[0])
         agent = _agent(spec, out)
-        pairs = json.loads((spec.folder(out) / DONE).read_text())["pairs"]
+        pairs = read_json(spec.folder(out) / DONE)["pairs"]
         missed = np.array([pair["goal"] for pair in pairs if not pair["success"]]).reshape(-1, agent.graph.goal_dim)
         centers = np.array([event.center for event in agent.events])
         title = f"{_name(spec)}:\n{len(centers)} events, {len(missed)} of {len(pairs)} goals missed"

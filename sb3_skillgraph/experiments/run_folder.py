@@ -1,20 +1,43 @@
-"""What a run keeps in its folder: checkpoints, from which it goes on exactly, and its log."""
+"""What a run keeps in its folder: checkpoints, from which it goes on exactly, its log, and a mark when it is done."""
 
 import csv
 import json
+import re
 import shutil
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch as th
+from filelock import FileLock
 from stable_baselines3.common.type_aliases import GymEnv
 
 from sb3_skillgraph.agent import SkillGraphAgent
-from sb3_skillgraph.saving import load_tree
+from sb3_skillgraph.files import PARTIAL, sync_folder
 
-AGENT, EXPERIENCE, CONFIG, PROGRESS = "agent.zip", "experience.zip", "config.json", "progress.csv"
+AGENT, EXPERIENCE, CONFIG, PROGRESS, DONE = "agent.zip", "experience.zip", "config.json", "progress.csv", "done.json"
+LOCK, UNNAMED = "lock", f"checkpoint{PARTIAL}"  # a checkpoint before it is whole, and after it has been let go
 STEPS = "time/total_timesteps"
+N_KEPT = 2  # checkpoints: should the newest be damaged, there is another
+T = TypeVar("T")
+
+
+@contextmanager
+def claimed(folder: Path) -> Iterator[None]:
+    """Keep a folder to oneself, and clear away what a command that was killed left half written.
+
+    :param folder: of a run; it is made if it is not there
+    :raises filelock.Timeout: if another process is at work in it
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    # The lock falls with the process that holds it, however that ends; a look at its status takes it for a moment.
+    with FileLock(folder / LOCK, timeout=1):
+        shutil.rmtree(folder / UNNAMED, ignore_errors=True)
+        for path in folder.glob(f".*{PARTIAL}"):
+            path.unlink()
+        yield
 
 
 def checkpoints(folder: Path) -> dict[int, Path]:
@@ -23,8 +46,42 @@ def checkpoints(folder: Path) -> dict[int, Path]:
     :param folder: of the run
     :return: by the number of steps
     """
-    found = (path for path in folder.glob("checkpoint_*") if path.is_dir())
-    return {int(path.name.partition("_")[2]): path for path in found}
+    found = ((re.fullmatch(r"checkpoint_(\d+)", path.name), path) for path in folder.glob("checkpoint_*"))
+    return {int(match[1]): path for match, path in found if match and path.is_dir()}
+
+
+def load_newest(folder: Path, load: Callable[[Path], T]) -> tuple[int, T | None]:
+    """Load the newest checkpoint that can be read.
+
+    :param folder: of the run
+    :param load: loads a checkpoint
+    :return: its steps, and what was loaded; ``(0, None)`` if there are no checkpoints
+    :raises ValueError: if there are some, and none can be read
+    """
+    saved = checkpoints(folder)
+    for n_steps in sorted(saved, reverse=True):
+        try:
+            return n_steps, load(saved[n_steps])
+        except Exception as error:  # whatever is raised for a damaged file
+            warnings.warn(f"{saved[n_steps]} cannot be read and is left out: {error}", stacklevel=2)
+    if saved:
+        raise ValueError(f"None of the checkpoints in {folder} can be read: remove them to begin anew.")
+    return 0, None
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Read a document that a run has written.
+
+    :param path: the file
+    :raises ValueError: if it is damaged
+    """
+    try:
+        document = json.loads(path.read_text())
+        if not isinstance(document, dict):
+            raise TypeError(f"it holds a {type(document).__name__}")
+        return document
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{path} is damaged: {error}.") from error
 
 
 def run_config(folder: Path) -> dict[str, Any]:
@@ -33,26 +90,11 @@ def run_config(folder: Path) -> dict[str, Any]:
     :param folder: of the run
     :raises ValueError: if its file is damaged
     """
-    path = folder / CONFIG
+    config = read_json(folder / CONFIG)
     try:
-        config: dict[str, Any] = json.loads(path.read_text())
         return {**config, "steps": int(config["steps"]), "env_kwargs": dict(config["env_kwargs"])}
     except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{path} is damaged: {error!r}.") from error
-
-
-def is_unfinished(folder: Path) -> bool:
-    """Tell whether a folder holds a run that was broken off: it has a checkpoint or, before there was one, too few steps.
-
-    :param folder: of the run
-    :raises ValueError: if its agent is damaged
-    """
-    if checkpoints(folder):
-        return True
-    if not ((folder / AGENT).exists() and (folder / CONFIG).exists()):
-        return False
-    n_steps: int = load_tree(folder / AGENT, "agent")["progress"]["counters"]["num_timesteps"]
-    return bool(n_steps < run_config(folder)["steps"])
+        raise ValueError(f"{folder / CONFIG} is damaged: {error!r}.") from error
 
 
 def stops(begin: int, end: int, every: int) -> list[int]:
@@ -66,20 +108,34 @@ def stops(begin: int, end: int, every: int) -> list[int]:
 
 
 def take_checkpoint(folder: Path, n_steps: int, save: Callable[[Path], None]) -> None:
-    """Take a checkpoint, and let go of those before; whenever this is broken off, there is a whole one.
+    """Take a checkpoint, and let go of the oldest; whenever this is broken off, there are whole ones.
 
     :param folder: of the run
     :param n_steps: environment steps done
     :param save: fills an empty folder
     """
-    before = checkpoints(folder)
-    partial = folder / "checkpoint.partial"
+    saved = checkpoints(folder)
+    if n_steps in saved:  # one that could not be read
+        discard(saved.pop(n_steps))
+    partial = folder / UNNAMED
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir()
     save(partial)
     partial.rename(folder / f"checkpoint_{n_steps}")
-    for path in before.values():
-        shutil.rmtree(path)
+    sync_folder(folder)
+    for _, path in sorted(saved.items(), reverse=True)[N_KEPT - 1 :]:
+        discard(path)
+
+
+def discard(checkpoint: Path) -> None:
+    """Remove a checkpoint, which is none any more before its first file is gone.
+
+    :param checkpoint: its folder
+    """
+    partial = checkpoint.with_name(UNNAMED)
+    shutil.rmtree(partial, ignore_errors=True)
+    checkpoint.rename(partial)
+    shutil.rmtree(partial)
 
 
 def save_agent(agent: SkillGraphAgent, folder: Path) -> None:
@@ -107,10 +163,15 @@ def load_agent(folder: Path, env: GymEnv, device: th.device | str = "auto") -> S
 def read_progress(folder: Path) -> list[dict[str, Any]]:
     """Read a run's rows.
 
-    :param folder: of the run
+    :param folder: of the run, or of a checkpoint
+    :raises ValueError: if its file is damaged
     """
     path = folder / PROGRESS
     if not path.exists():
         return []
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
+    try:
+        with path.open(newline="") as file:
+            rows = list(csv.DictReader(file))
+        return [{**row, STEPS: int(row[STEPS])} for row in rows]
+    except (KeyError, TypeError, ValueError, csv.Error) as error:
+        raise ValueError(f"{path} is damaged: {error!r}.") from error

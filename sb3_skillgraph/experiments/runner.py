@@ -3,10 +3,9 @@
 import csv
 import io
 import json
-import os
-import shutil
 import time
 import traceback
+import warnings
 from collections.abc import Sequence
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import AbstractContextManager, nullcontext
@@ -23,10 +22,24 @@ from sb3_skillgraph.evaluation import PairsResult, evaluate_pairs, run_pair
 from sb3_skillgraph.experiments.console import versions
 from sb3_skillgraph.experiments.learners import ALGORITHMS, Learner
 from sb3_skillgraph.experiments.plan import RunSpec
-from sb3_skillgraph.experiments.run_folder import CONFIG, PROGRESS, STEPS, checkpoints, read_progress, take_checkpoint
+from sb3_skillgraph.experiments.run_folder import (
+    CONFIG,
+    DONE,
+    LOCK,
+    PROGRESS,
+    STEPS,
+    checkpoints,
+    claimed,
+    discard,
+    load_newest,
+    read_json,
+    read_progress,
+    take_checkpoint,
+)
 from sb3_skillgraph.experiments.training import plain
+from sb3_skillgraph.files import write_text
 
-DONE, ERROR, LOCK = "done.json", "error.txt", "lock"
+ERROR = "error.txt"
 SECONDS = "time/seconds"
 STRETCH = 1_000  # environment steps between tests at test time: an episode
 Outcome = Literal["done", "skipped", "elsewhere", "failed", "refused"]
@@ -131,11 +144,9 @@ def has_other_settings(spec: RunSpec, out: Path) -> bool:
     begun = (folder / DONE).exists() or (folder / PROGRESS).exists() or bool(checkpoints(folder))
     if not begun or not (folder / CONFIG).exists():
         return False
-    before = json.loads((folder / CONFIG).read_text())
-    del before["versions"]
+    before = read_json(folder / CONFIG)
+    before.pop("versions", None)
     now = json.loads(_settings(spec))
-    if "resolved" not in before:  # a run from before that was written down
-        del now["resolved"]
     return bool(before != now)
 
 
@@ -155,22 +166,24 @@ def run(spec: RunSpec, out: Path) -> Outcome:
     """
     th.set_num_threads(1)
     folder = spec.folder(out)
-    folder.mkdir(parents=True, exist_ok=True)
     try:
-        # The lock falls with the process that holds it, however that ends.
-        with FileLock(folder / LOCK, timeout=1):  # a look at its status takes the lock for a moment
-            if has_other_settings(spec, out):
-                return "refused"
-            if (folder / DONE).exists():
-                return "skipped"
+        with claimed(folder):
             try:
+                if has_other_settings(spec, out):
+                    return "refused"
+                if (folder / DONE).exists():
+                    read_json(folder / DONE)  # or it is damaged
+                    return "skipped"
                 _Run(spec, folder).do()
             except Exception:
-                write_atomically(folder / ERROR, traceback.format_exc())
+                write_text(folder / ERROR, traceback.format_exc())
                 return "failed"
             return "done"
     except Timeout:
         return "elsewhere"
+    except OSError as error:
+        warnings.warn(f"{folder} cannot be used: {error}", stacklevel=2)
+        return "failed"
 
 
 class _Run:
@@ -189,7 +202,7 @@ class _Run:
         begin = self._resume(self.learner)
         if not begin:
             document = {**json.loads(_settings(spec)), "versions": versions()}
-            write_atomically(folder / CONFIG, json.dumps(document, indent=1) + "\n")
+            write_text(folder / CONFIG, json.dumps(document, indent=1) + "\n")
         self._clock = time.perf_counter()
         if begin < spec.steps:
             self.learner.learn(begin, spec.steps, spec.check_every, self._check)
@@ -213,19 +226,17 @@ class _Run:
             "test_time": self._test_time(result),
             **self.learner.summary(),
         }
-        write_atomically(folder / DONE, json.dumps(document, indent=1) + "\n")
+        write_text(folder / DONE, json.dumps(document, indent=1) + "\n")
+        for _, path in sorted(checkpoints(folder).items())[:-1]:
+            discard(path)
 
     def _resume(self, learner: Learner) -> int:
         """Load the newest checkpoint and drop what was written after it; return the steps done."""
-        saved = checkpoints(self.folder)
         if not learner.resumable:
-            for path in saved.values():
-                shutil.rmtree(path)
-            saved = {}
-        steps = max(saved, default=0)
-        if steps:
-            learner.load(saved[steps])
-        self.rows = [row for row in read_progress(self.folder) if int(row[STEPS]) <= steps]
+            for path in checkpoints(self.folder).values():
+                discard(path)
+        steps, _ = load_newest(self.folder, learner.load)
+        self.rows = [row for row in read_progress(self.folder) if row[STEPS] <= steps]
         if not self.rows:
             (self.folder / PROGRESS).unlink(missing_ok=True)
         self.seconds = float(self.rows[-1][SECONDS]) if self.rows else 0.0
@@ -242,11 +253,11 @@ class _Run:
         writer = csv.DictWriter(text, list(self.rows[-1]), lineterminator="\n")
         writer.writeheader()
         writer.writerows(self.rows)
-        write_atomically(self.folder / PROGRESS, text.getvalue())
+        write_text(self.folder / PROGRESS, text.getvalue())
         snapshot = self.learner.snapshot()
         if snapshot is not None:
             document = json.dumps({"steps": n_steps, **snapshot})
-            write_atomically(self.folder / f"graph_{n_steps}.json", document + "\n")
+            write_text(self.folder / f"graph_{n_steps}.json", document + "\n")
         take_checkpoint(self.folder, n_steps, self.learner.save)
         self._clock = time.perf_counter()
 
@@ -294,20 +305,6 @@ class Pinned(gym.Wrapper):
         return self.env.reset(seed=seed, options=self.options)
 
 
-def write_atomically(path: Path, text: str) -> None:
-    """Write a file that is either as it was or complete, whatever happens.
-
-    :param path: the file
-    :param text: what it is to hold
-    """
-    partial = path.with_name(f"{path.name}.partial")
-    with partial.open("w") as file:
-        file.write(text)
-        file.flush()
-        os.fsync(file.fileno())
-    partial.replace(path)
-
-
 def status(specs: Sequence[RunSpec], out: Path) -> list[RunStatus]:
     """Tell how runs stand.
 
@@ -330,11 +327,14 @@ def by_method(runs: Sequence[RunStatus]) -> dict[tuple[str, str], list[RunStatus
 
 
 def _status(spec: RunSpec, out: Path) -> RunStatus:
-    if has_other_settings(spec, out):
-        return RunStatus(spec, "other", 0, None, None)
     folder = spec.folder(out)
-    rows = read_progress(folder)
-    steps = int(rows[-1][STEPS]) if rows else 0
+    try:
+        if has_other_settings(spec, out):
+            return RunStatus(spec, "other", 0, None, None)
+        rows = read_progress(folder)
+    except ValueError:  # damaged: who does the run says how
+        return RunStatus(spec, "failed", 0, None, None)
+    steps = rows[-1][STEPS] if rows else 0
     rate = float(rows[-1]["eval/success_rate"]) if rows else None
     if (folder / DONE).exists():
         return RunStatus(spec, "done", steps, 0.0, rate)

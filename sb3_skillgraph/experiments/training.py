@@ -11,6 +11,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from filelock import Timeout
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import HumanOutputFormat, Logger, TensorBoardOutputFormat, configure
@@ -21,17 +22,22 @@ from sb3_skillgraph.experiments.console import UserError, for_people, versions
 from sb3_skillgraph.experiments.run_folder import (
     AGENT,
     CONFIG,
+    DONE,
+    EXPERIENCE,
     PROGRESS,
     STEPS,
     checkpoints,
-    is_unfinished,
+    claimed,
+    discard,
     load_agent,
+    load_newest,
     read_progress,
     run_config,
     save_agent,
     stops,
     take_checkpoint,
 )
+from sb3_skillgraph.files import write_text
 from sb3_skillgraph.rules import PaperRules
 
 CHECKPOINT_EVERY = 10_000  # environment steps
@@ -60,43 +66,72 @@ def train(
     :param arguments: of :class:`~sb3_skillgraph.SkillGraphAgent`
     :param steps: environment steps in all
     :param seed: of everything random
-    :param out: receives ``agent.zip`` and ``experience.zip`` (when interrupted, too), ``progress.csv``, ``config.json``
-        and, until the end, the newest checkpoint
+    :param out: receives ``agent.zip`` and ``experience.zip`` (when interrupted, too), ``progress.csv``, ``config.json``,
+        until the end the newest checkpoints, and then ``done.json``
     :param n_envs: copies of the environment
     :param device: torch device
     :param verbose: whether to print SB3's table as well as the progress bar
     :param tensorboard: whether to write a log for TensorBoard, too
     :return: the agent
-    :raises UserError: if an argument is refused, or the folder holds a run with other ones
+    :raises UserError: if an argument is refused, another command is at work in the folder, or it holds something else
     """
     config = dict(env=env_id, env_kwargs=env_kwargs, steps=steps, seed=seed, n_envs=n_envs, arguments=arguments)
-    saved = checkpoints(out)
-    if (out / CONFIG).exists() and (saved or (out / AGENT).exists()):
-        done = _check_config(out, config)
-        if not is_unfinished(out):
-            saved = {done: out}
     with for_people():
         env = make_vec_env(env_id, n_envs=n_envs, env_kwargs=env_kwargs)
     try:
-        with for_people():
-            begin = max(saved, default=0)
-            if saved:
-                agent = load_agent(saved[begin], env, device)
+        with for_people():  # who mistypes something leaves no folder
+            agent = SkillGraphAgent(env=env, seed=seed, **{"device": device, **arguments})
+        with _claimed(out):
+            with for_people():
+                _check_folder(out, config)
+                begin, loaded = load_newest(out, lambda folder: load_agent(folder, env, device))
+                rows = read_progress(checkpoints(out)[begin]) if loaded is not None else []
+            if loaded is not None:
                 fresh = "" if env.has_attr("get_state") else f", at a fresh episode: {env_id} cannot tell its state"
                 print(f"going on after {begin} steps{fresh}")
-                if saved[begin] == out:  # what is trained further must not be lost
-                    take_checkpoint(out, begin, lambda folder: save_agent(agent, folder))
-            else:
-                agent = SkillGraphAgent(env=env, seed=seed, **{"device": device, **arguments})
-        out.mkdir(parents=True, exist_ok=True)
-        write_json(out / CONFIG, {**config, "versions": versions()})
-        rows = [row for row in read_progress(out) if int(row[STEPS]) <= agent.num_timesteps]
-        agent.set_logger(_logger(out, rows, verbose, tensorboard))
-        elapsed = float(rows[-1].get("time/time_elapsed") or 0.0) if rows else 0.0
-        _learn(agent, begin, steps, out, elapsed)
-        return agent
+                agent = loaded
+            write_json(out / CONFIG, {**config, "versions": versions()})
+            agent.set_logger(_logger(out, rows, verbose, tensorboard))
+            elapsed = float(rows[-1].get("time/time_elapsed") or 0.0) if rows else 0.0
+            _learn(agent, begin, steps, out, elapsed)
+            return agent
     finally:
         env.close()
+
+
+@contextmanager
+def _claimed(out: Path) -> Iterator[None]:
+    try:
+        with claimed(out):
+            yield
+    except Timeout as error:
+        raise UserError(f"another command is at work in {out}.") from error
+
+
+def _check_folder(out: Path, config: dict[str, Any]) -> None:
+    """Refuse a folder that holds something else; let what is finished go on."""
+    if not (out / CONFIG).exists():
+        if (out / AGENT).exists():
+            raise UserError(f"{out} holds an agent already; give another folder with --out, or remove it.")
+        return
+    if not checkpoints(out) and not (out / AGENT).exists():
+        return  # nothing came of it
+    done = _check_config(out, config)
+    if not (out / DONE).exists():
+        return
+    _discard_checkpoints(out)
+    if config["steps"] <= done:
+        raise UserError(
+            f"{out} holds an agent already, of {done} steps: give more --steps to train it further, another folder with "
+            "--out, or remove it."
+        )
+    take_checkpoint(out, done, lambda folder: _copy_run(out, folder))
+    (out / DONE).unlink()
+
+
+def _copy_run(out: Path, folder: Path) -> None:
+    for name in (AGENT, EXPERIENCE, PROGRESS):
+        shutil.copy2(out / name, folder)
 
 
 def _learn(agent: SkillGraphAgent, begin: int, steps: int, out: Path, elapsed: float) -> None:
@@ -111,7 +146,7 @@ def _learn(agent: SkillGraphAgent, begin: int, steps: int, out: Path, elapsed: f
                     _print_line(agent, steps)
                 begin = target
                 if target < steps and (target % CHECKPOINT_EVERY == 0 or is_asked_to_stop()):
-                    take_checkpoint(out, target, lambda folder: save_agent(agent, folder))
+                    take_checkpoint(out, target, lambda folder: _save(agent, out, folder))
                 if target < steps and is_asked_to_stop():
                     raise KeyboardInterrupt
     finally:
@@ -123,8 +158,20 @@ def _learn(agent: SkillGraphAgent, begin: int, steps: int, out: Path, elapsed: f
             print(f"{agent.num_timesteps} steps; the agent is in {out / AGENT}, its log in {out / PROGRESS}")
         if agent.num_timesteps < steps:
             print(f"the same command goes on after {max(checkpoints(out), default=0)} steps")
+    write_json(out / DONE, {"steps": agent.num_timesteps})
+    _discard_checkpoints(out)
+
+
+def _discard_checkpoints(out: Path) -> None:
     for path in checkpoints(out).values():
-        shutil.rmtree(path)
+        discard(path)
+
+
+def _save(agent: SkillGraphAgent, out: Path, folder: Path) -> None:
+    """Save what a run goes on from; its log, too, which is begun anew then."""
+    save_agent(agent, folder)
+    if (out / PROGRESS).exists():
+        shutil.copy2(out / PROGRESS, folder)
 
 
 class Clock(BaseCallback):
@@ -146,7 +193,7 @@ class Clock(BaseCallback):
 
 @contextmanager
 def _stopped_politely() -> Iterator[Callable[[], bool]]:
-    """Wait with Ctrl-C until it is asked for; a second one interrupts at once."""
+    """Wait with Ctrl-C, or what a cluster sends before it kills, until it is asked for; a second one interrupts at once."""
     asked: list[int] = []
 
     def ask(number: int, frame: Any) -> None:
@@ -155,15 +202,17 @@ def _stopped_politely() -> Iterator[Callable[[], bool]]:
         asked.append(number)
         print("stopping soon, so that the same command can go on from here; Ctrl-C again stops at once", flush=True)
 
+    signals = (signal.SIGINT, signal.SIGTERM)
     try:
-        before = signal.signal(signal.SIGINT, ask)
+        before = [signal.signal(number, ask) for number in signals]
     except ValueError:  # not in the main thread, where nobody presses Ctrl-C
         yield lambda: False
         return
     try:
         yield lambda: bool(asked)
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, handler in zip(signals, before, strict=True):
+            signal.signal(number, handler)
 
 
 def _print_line(agent: SkillGraphAgent, steps: int) -> None:
@@ -177,9 +226,9 @@ def _logger(out: Path, rows: list[dict[str, Any]], verbose: bool, tensorboard: b
     logger = configure(str(out), ["csv"])
     for row in rows:
         for name, value in row.items():
-            if value:
-                logger.record(name, float(value) if set(value) - set("-0123456789") else int(value))
-        logger.dump(int(row[STEPS]))
+            if value != "":
+                logger.record(name, float(value) if set(str(value)) - set("-0123456789") else int(value))
+        logger.dump(row[STEPS])
     if verbose:
         logger.output_formats.append(HumanOutputFormat(sys.stdout))
     if tensorboard:
@@ -207,8 +256,7 @@ def write_json(path: Path, document: dict[str, Any]) -> None:
     :param path: the file
     :param document: plain data; classes, such as ``option_class``, are written by their names
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(_as_json(document) + "\n")
+    write_text(path, _as_json(document) + "\n")
 
 
 def _as_json(document: dict[str, Any]) -> str:
