@@ -33,6 +33,7 @@ from sb3_skillgraph.plan import Plan
 from sb3_skillgraph.rules import PaperRules
 from sb3_skillgraph.runner import Run, RunnerState
 from sb3_skillgraph.saving import PathOrFile, load_tree, save_tree
+from sb3_skillgraph.schema import check_learned
 from sb3_skillgraph.vec_env import LeanVecEnv
 
 SelfSkillGraphAgent = TypeVar("SelfSkillGraphAgent", bound="SkillGraphAgent")
@@ -253,10 +254,17 @@ class SkillGraphAgent(OffPolicyAlgorithm):
         state are put where they were.
 
         :return: the agent
-        :raises ValueError: if an observation holds NaN or inf
+        :raises ValueError: if an observation, or what the policy does, holds NaN or inf
+        :raises RuntimeError: if an environment, or its worker process, cannot be reached any more
         """
-        with self._interrupts.watched():
-            return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)  # type: ignore[arg-type]
+        try:
+            with self._interrupts.watched():
+                return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)  # type: ignore[arg-type]
+        except (EOFError, ConnectionError) as error:
+            raise RuntimeError(
+                f"The environment, or a worker process of it, cannot be reached any more ({error!r}). The agent can be saved, "
+                "and learning goes on after set_env(another, force_reset=True)."
+            ) from error
 
     def _setup_learn(
         self,
@@ -519,6 +527,7 @@ class SkillGraphAgent(OffPolicyAlgorithm):
         :raises OSError: if the file cannot be written; an old file of that name is then untouched
         """
         tree = persistence.agent_tree(self, set(exclude or ()) - set(include or ()))
+        check_learned(self, tree, None)  # what load would refuse is not written
         save_tree(path, "agent", tree, by_name=("arguments",))
 
     def save_replay_buffer(self, path: PathOrFile) -> None:

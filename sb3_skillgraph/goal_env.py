@@ -10,7 +10,8 @@ from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, is_vecenv_wr
 from sb3_skillgraph.metric import Metric, Product, Rotation, Within, as_metric
 from sb3_skillgraph.options.views import BODY_NUMBERS, View, as_view, body_view, egocentric_view, placed_body_view
 
-FLOAT32_MAX = float(np.finfo(np.float32).max)
+#: Numbers beyond which nobody measures: their squares must fit a float32.
+HUGE = 1e15
 KEYS = ("observation", "achieved_goal", "desired_goal")
 
 
@@ -42,12 +43,15 @@ class GoalSpec(NamedTuple):
         if not all(isinstance(box, spaces.Box) for box in observation_space.spaces.values()):
             raise ValueError(f"SkillGraphAgent needs {wanted}; this environment has {observation_space}.")
         shapes = [box.shape for box in boxes]
-        if shapes[1] != shapes[2] or shapes[1] is None or len(shapes[1]) != 1:
+        if shapes[1] != shapes[2] or shapes[1] is None or len(shapes[1]) != 1 or shapes[1][0] == 0:
             raise ValueError(
-                f"'achieved_goal' and 'desired_goal' must be vectors of the same length, not {shapes[1]} and {shapes[2]}."
+                "'achieved_goal' and 'desired_goal' must be vectors of the same length, at least 1, not of shapes "
+                f"{shapes[1]} and {shapes[2]}."
             )
         if not isinstance(action_space, spaces.Box):
             raise ValueError(f"SkillGraphAgent needs continuous actions (a Box action space), not {action_space}.")
+        if action_space.dtype.kind != "f" or 0 in action_space.shape:
+            raise ValueError(f"SkillGraphAgent needs actions of floating point numbers, at least one, not {action_space}.")
         if not (np.isfinite(action_space.low).all() and np.isfinite(action_space.high).all()):
             raise ValueError(f"SkillGraphAgent needs an action space with finite bounds, not {action_space}.")
         sizes = [int(np.prod(shape)) for shape in (shapes[0] or (), shapes[1], action_space.shape)]
@@ -142,23 +146,23 @@ def with_terminal(new_obs: dict[str, np.ndarray], dones: np.ndarray, infos: list
 
 
 def check_finite(observation: dict[str, np.ndarray], step: int) -> None:
-    """Refuse observations that hold NaN or inf.
+    """Refuse observations that hold NaN, inf or numbers beyond ``HUGE``.
 
     :param observation: Dict observation with a leading axis of environments
     :param step: number of environment steps taken so far
     :raises ValueError: naming the entry, the environment and the step
     """
     for key in KEYS:
-        # The sum of squares tells at once that all is well; where it is no number, or so large that a float32 may not
-        # hold what it comes from, the entry is looked at as it would be stored.
-        if np.vdot(observation[key], observation[key]) < FLOAT32_MAX:
+        # The sum of squares tells at once that all is well; where it does not, the entry is looked at as it would be stored.
+        if np.vdot(observation[key], observation[key]) < HUGE**2:
             continue
         array = rows(observation, key)
-        if not np.isfinite(array).all():
-            env = int(np.flatnonzero(~np.isfinite(array).all(axis=1))[0])
+        good = np.abs(array) <= HUGE
+        if not good.all():
+            env = int(np.flatnonzero(~good.all(axis=1))[0])
             raise ValueError(
-                f"{key!r} of environment {env} holds NaN or inf at step {step}: {array[env]}. The step was not stored; "
-                "the agent can still be saved, and learning can go on after the environment is mended."
+                f"{key!r} of environment {env} holds NaN, inf or a number beyond {HUGE:g} at step {step}: {array[env]}. The "
+                "step was not stored; the agent can still be saved, and learning can go on after the environment is mended."
             )
 
 

@@ -14,7 +14,7 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.noise import VectorizedActionNoise
+from stable_baselines3.common.noise import ActionNoise, VectorizedActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.save_util import recursive_getattr
 from stable_baselines3.common.utils import check_for_correct_spaces
@@ -80,7 +80,7 @@ def _progress(agent: Any) -> dict[str, Any]:
     return {
         "counters": {name: getattr(agent, name) for name in _COUNTERS},
         "current_progress_remaining": agent._current_progress_remaining,
-        "ep_info_buffer": list(agent.ep_info_buffer or ()),
+        "ep_info_buffer": [episode for info in agent.ep_info_buffer or () for episode in _measured(info)],
         "ep_success_buffer": [bool(success) for success in agent.ep_success_buffer or ()],
         "rollout": rollout.get_state(),
         "salience": _told("The salience", salience.get_state) if hasattr(salience, "get_state") else None,
@@ -92,6 +92,12 @@ def _progress(agent: Any) -> dict[str, Any]:
         },
         "environments": _snapshot(agent),
     }
+
+
+def _measured(info: dict[str, Any]) -> list[dict[str, float]]:
+    """Return what SB3 logs of an episode; nothing if its reward is no number, which means nothing here anyway."""
+    measured = {name: float(info[name]) for name in ("r", "l", "t")}
+    return [measured] if np.isfinite(list(measured.values())).all() else []
 
 
 def _told(who: str, get_state: Callable[[], Any]) -> Any:
@@ -172,7 +178,7 @@ def _build(cls: Any, tree: dict[str, Any], env: Any, device: Any, given: dict[st
     if isinstance(noise, VectorizedActionNoise) and noise.n_envs != agent.n_envs:
         agent.action_noise = noise.base_noise
     agent._setup_model()
-    check_learned(agent, tree)
+    check_learned(agent, tree, agent.env)
     _restore(agent, tree, same_envs=agent.n_envs == tree["n_envs"] and not force_reset)
     agent._loaded = tree["update_path"]
     return agent
@@ -355,6 +361,8 @@ def require_callables(arguments: Any, name: str = "") -> None:
     elif isinstance(arguments, list | tuple):
         for value in arguments:
             require_callables(value, name)
+    elif isinstance(arguments, ActionNoise):
+        require_callables(vars(arguments), name)
 
 
 def describe_space(space: spaces.Space) -> dict[str, Any]:

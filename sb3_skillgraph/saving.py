@@ -184,7 +184,7 @@ def _write(file: Any, document: dict[str, Any], encoder: _Encoder) -> None:
         for dtype, parts in encoder.parts.items():
             name = dtype[1:] if dtype[0] != ">" else f"big_endian_{dtype[1:]}"
             with archive.open(f"arrays/{name}.npy", "w", force_zip64=True) as member:
-                np.lib.format.write_array(member, np.concatenate(parts), allow_pickle=False)
+                np.lib.format.write_array(member, np.concatenate(parts, dtype=dtype), allow_pickle=False)
 
 
 def load_tree(path: PathOrFile, kind: str, suffix: str = ".zip") -> dict[str, Any]:

@@ -9,6 +9,7 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.save_util import recursive_getattr
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_skillgraph.checking import (
     HUGE,
@@ -81,11 +82,12 @@ def _size(tree: Any) -> int:
     return 0
 
 
-def check_learned(agent: Any, tree: dict[str, Any]) -> None:
-    """Check what an agent has learned, against an agent of the same arguments that has learned nothing.
+def check_learned(agent: Any, tree: dict[str, Any], env: VecEnv | None) -> None:
+    """Check what an agent has learned, against an agent of the same arguments.
 
-    :param agent: the new agent
+    :param agent: the agent that is loaded, or saved
     :param tree: what the file holds
+    :param env: is asked whether it takes the states of environments; None not to ask
     :raises ValueError: naming what is wrong
     """
     check_parameters(agent.parts.walker.learner, tree["parameters"])
@@ -102,7 +104,7 @@ def check_learned(agent: Any, tree: dict[str, Any]) -> None:
         graph=_graph(n_events, spec.goal_dim),
         model=_model(metric.n_matched),
         skills=list_of(entries(record=anything, parameters=anything)),
-        progress=_progress(tree["n_envs"], spec, n_events, metric.n_matched, agent),
+        progress=_progress(tree["n_envs"], spec, n_events, metric.n_matched, agent, env),
     )(tree, "the file")
     _check_edges(tree["graph"], n_events)
 
@@ -204,9 +206,9 @@ def _model(n_matched: int) -> Check:
 # -- where learning stands --------------------------------------------------------------------------------------------
 
 
-def _progress(n_envs: int, spec: Any, n_events: int, n_matched: int, agent: Any) -> Check:
+def _progress(n_envs: int, spec: Any, n_events: int, n_matched: int, agent: Any, env: VecEnv | None) -> Check:
     counters = ("num_timesteps", "_total_timesteps", "_num_timesteps_at_start", "_episode_num", "_n_updates")
-    episode = entries(True, r=number(), l=number(), t=number())
+    episode = entries(r=number(), l=number(), t=number())
     return entries(
         counters=entries(**dict.fromkeys(counters, whole())),
         current_progress_remaining=number(-1e9, 1.0),
@@ -216,7 +218,7 @@ def _progress(n_envs: int, spec: Any, n_events: int, n_matched: int, agent: Any)
         salience=anything,
         rng=_pcg64,
         global_generators=entries(python=list_of(anything, 3), numpy=_mt19937, torch=anything),
-        environments=optional(_environments(n_envs, agent)),
+        environments=optional(_environments(n_envs, agent, env)),
     )
 
 
@@ -287,10 +289,9 @@ def _at_most(n: int, check: Check) -> Check:
     return check_length
 
 
-def _environments(n_envs: int, agent: Any) -> Check:
+def _environments(n_envs: int, agent: Any, env: VecEnv | None) -> Check:
     """Check the states of environments: of the one that is given, if it can tell its own."""
     shown = {name: _shown(n_envs, box) for name, box in agent.observation_space.spaces.items()}
-    env = agent.env
     if env is not None and env.num_envs == n_envs and env.has_attr("get_state"):
         own = env.env_method("get_state", indices=0)[0]
         shapes = entries(**{name: _like_any(value) for name, value in own.items()}) if isinstance(own, dict) else anything

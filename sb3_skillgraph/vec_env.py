@@ -1,5 +1,7 @@
 """SB3's vector of environments without its copies."""
 
+from typing import Any
+
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
@@ -20,7 +22,7 @@ class LeanVecEnv(DummyVecEnv):
     def __init__(self, envs: list[gym.Env]) -> None:
         super().__init__([lambda env=env: env for env in envs])  # type: ignore[misc]
         assert isinstance(self.observation_space, spaces.Dict)
-        self._dtypes = {key: space.dtype for key, space in self.observation_space.spaces.items()}
+        self._boxes = {key: (box.dtype, (len(envs), *(box.shape or ()))) for key, box in self.observation_space.spaces.items()}
 
     def step_wait(self) -> VecEnvStepReturn:
         """Step every environment, and reset those whose episode has ended.
@@ -39,5 +41,23 @@ class LeanVecEnv(DummyVecEnv):
             rewards.append(reward)
             dones.append(done)
             infos.append(info)
-        stacked = {key: np.array([o[key] for o in observations], dtype=dtype) for key, dtype in self._dtypes.items()}
-        return stacked, np.array(rewards, dtype=np.float32), np.array(dones, dtype=bool), infos
+        return self._stacked(observations), np.array(rewards, dtype=np.float32), np.array(dones, dtype=bool), infos
+
+    def _stacked(self, observations: list[Any]) -> dict[str, np.ndarray]:
+        stacked = {}
+        for key, (dtype, shape) in self._boxes.items():
+            try:
+                stacked[key] = np.array([observation[key] for observation in observations], dtype=dtype)
+            except (KeyError, TypeError, ValueError) as error:
+                raise ValueError(f"The environment's observation has no such {key!r} as its space says: {error!r}.") from error
+            if stacked[key].shape != shape:
+                raise ValueError(
+                    f"The environment's observation has a {key!r} of shape {stacked[key].shape[1:]}, and its space says "
+                    f"{shape[1:]}."
+                )
+        return stacked
+
+    def _save_obs(self, env_idx: int, obs: Any) -> None:
+        """Keep what a reset has shown, as the parent does, if it is what the space says."""
+        for key, values in self._stacked([obs] * len(self.envs)).items():
+            self.buf_obs[key][env_idx] = values[0]

@@ -10,7 +10,7 @@ import signal
 import zipfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -32,7 +32,8 @@ from conftest import (
 from fuzz import members, packed
 from gymnasium import spaces
 from stable_baselines3 import DDPG
-from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
 from sb3_skillgraph import OptionEnv, SkillGraphAgent
 from sb3_skillgraph.events import Event
@@ -54,6 +55,12 @@ class Spaces(gym.Env):
         given = {"observation": point, "achieved_goal": point, "desired_goal": point, **entries}
         self.observation_space = spaces.Dict({key: space for key, space in given.items() if space is not None})
         self.action_space = action or spaces.Box(-1.0, 1.0, (2,))
+
+
+class Named(NamedTuple):
+    """A named tuple, which would come back as a plain one."""
+
+    number: int
 
 
 class Hidden(gym.Wrapper):
@@ -87,8 +94,14 @@ class Hidden(gym.Wrapper):
         (lambda: Spaces(action=spaces.Discrete(4)), "continuous actions"),
         (lambda: Spaces(action=spaces.MultiBinary(2)), "continuous actions"),
         (lambda: Spaces(action=spaces.Box(-np.inf, np.inf, (2,))), "finite"),
+        (lambda: Spaces(action=spaces.Box(-1, 1, (2,), np.int64)), "floating point"),
+        (lambda: Spaces(action=spaces.Box(-1.0, 1.0, (0,))), "at least one"),
+        (lambda: Spaces(**dict.fromkeys(("achieved_goal", "desired_goal"), spaces.Box(-1.0, 1.0, (0,)))), "at least 1"),
     ],
-    ids=["flat", "no goal", "discrete", "nested", "extra", "lengths", "Discrete", "MultiBinary", "unbounded"],
+    ids=[
+        *("flat", "no goal", "discrete", "nested", "extra", "lengths", "Discrete", "MultiBinary", "unbounded"),
+        *("whole numbers", "no actions", "no goal numbers"),
+    ],
 )
 def test_environment_that_does_not_fit(env: Callable[[], gym.Env], message: str) -> None:
     with pytest.raises(ValueError, match=message):
@@ -584,6 +597,153 @@ def test_folder_that_cannot_be_made(trained: SkillGraphAgent, tmp_path: Path) ->
     (tmp_path / "file").touch()
     with pytest.raises(OSError, match="file"):
         trained.save(tmp_path / "file" / "agent.zip")
+
+
+# -- what could not be read again is not written ------------------------------------------------------------------------
+
+
+class OwnNoise(NormalActionNoise):
+    """A user's own class, of the name of which no file knows anything."""
+
+
+class Telling(gym.Wrapper):
+    """Tells a state of its own.
+
+    :param state: what it tells, or an error that it raises
+    """
+
+    def __init__(self, state: Any) -> None:
+        super().__init__(gym.make(TOY))
+        self.state = state
+
+    def get_state(self) -> Any:
+        if isinstance(self.state, Exception):
+            raise self.state
+        return self.state
+
+    def set_state(self, state: Any) -> None:
+        self.state = state
+
+
+@pytest.mark.parametrize("n_envs", [1, 2])
+def test_noise_of_a_class_of_ones_own_must_be_given_again(tmp_path: Path, n_envs: int) -> None:
+    noise = OwnNoise(np.zeros(2), 0.1 * np.ones(2))
+    new_agent(new_vec_env(n_envs=n_envs), action_noise=noise).learn(20).save(tmp_path / "agent")
+    with pytest.raises(ValueError, match=r"load\(..., action_noise=...\)"):
+        SkillGraphAgent.load(tmp_path / "agent")
+    SkillGraphAgent.load(tmp_path / "agent", env=new_vec_env(n_envs=n_envs), action_noise=noise).learn(20)
+
+
+STATES = [
+    (RuntimeError("the simulator is gone"), "the simulator is gone"),
+    ({"random": b"bytes"}, "its state/states/0/random cannot be saved: a bytes has no encoding"),
+    ({"seen": {1, 2}}, "seen cannot be saved: a set"),
+    ({"when": np.datetime64("2020-01-01")}, "when cannot be saved"),
+    ({"rows": np.zeros(2, [("x", "f4")])}, "rows cannot be saved: an array of"),
+    ({"named": Named(1)}, "named cannot be saved: a Named"),
+    ({"masked": np.ma.masked_array([1.0], [True])}, "masked cannot be saved: a MaskedArray"),
+]
+
+
+@pytest.mark.parametrize(("state", "message"), STATES, ids=[message[:20] for _, message in STATES])
+def test_a_state_that_cannot_be_saved_is_left_out(tmp_path: Path, state: Any, message: str) -> None:
+    agent = new_agent(Telling(state)).learn(30)
+    with pytest.warns(UserWarning, match="The environment cannot tell its state.*" + message):
+        agent.save(tmp_path / "agent")
+    assert SkillGraphAgent.load(tmp_path / "agent", env=gym.make(TOY)).learn(30, reset_num_timesteps=False).num_timesteps == 60
+
+
+def test_arrays_of_another_byte_order_come_back(tmp_path: Path) -> None:
+    state = {"big": np.array([1.0, 2.0], ">f8"), "little": np.array([3.0], "<f8"), "words": np.array(["a", "bc"])}
+    agent = new_agent(Telling(state)).learn(30)
+    agent.save(tmp_path / "agent")
+    env = Telling(copy.deepcopy(state))
+    loaded = SkillGraphAgent.load(tmp_path / "agent", env=env)
+    env.state = {}
+    loaded.learn(30, reset_num_timesteps=False)
+    assert differences(state, env.state) == []
+
+
+def test_an_observation_space_of_another_byte_order(tmp_path: Path) -> None:
+    class Big(gym.ObservationWrapper):
+        def __init__(self) -> None:
+            super().__init__(gym.make(TOY))
+            entries = self.env.observation_space.spaces.items()  # type: ignore[attr-defined]
+            boxes = {
+                key: spaces.Box(box.low.astype(">f4"), box.high.astype(">f4"), dtype=np.dtype(">f4")) for key, box in entries
+            }
+            self.observation_space = spaces.Dict(boxes)
+
+        def observation(self, observation: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+            return {key: value.astype(">f4") for key, value in observation.items()}
+
+    agent = new_agent(Big()).learn(250)
+    agent.save(tmp_path / "agent")
+    assert SkillGraphAgent.load(tmp_path / "agent", env=Big()).learn(20, reset_num_timesteps=False).num_timesteps == 270
+
+
+def test_parameters_that_are_no_numbers_are_called_so(tmp_path: Path) -> None:
+    agent = new_agent().learn(250)
+    with th.no_grad():
+        next(agent.policy.actor.parameters())[0, 0] = float("nan")
+    agent.set_parameters(agent.get_parameters())
+    for act in (lambda: agent.predict(agent.env.reset()), lambda: agent.learn(50, reset_num_timesteps=False)):
+        with pytest.raises(ValueError, match="policy's parameters hold NaN"):
+            act()
+    with pytest.raises(ValueError, match="parameters/"):
+        agent.save(tmp_path / "agent")
+    assert not list(tmp_path.iterdir())
+
+
+# -- environments that do something else than they say ----------------------------------------------------------------
+
+
+@pytest.mark.parametrize("on_reset", [False, True])
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        (np.zeros(5), "has a 'observation' of shape"),
+        (np.zeros(1), "has a 'observation' of shape"),
+        (None, "has a 'observation' of shape"),
+        (np.array(["a", "b"]), "no such 'observation' as its space says"),
+        ("gone", "no such 'observation' as its space says: KeyError"),
+        (np.full(2, 1e20), "number beyond 1e.15"),
+    ],
+    ids=["too long", "too short", "None", "text", "gone", "huge"],
+)
+def test_an_observation_that_is_not_what_its_space_says(value: Any, message: str, on_reset: bool) -> None:
+    def fault(observation: dict[str, Any]) -> None:
+        observation["observation"] = value
+        if isinstance(value, str):
+            del observation["observation"]
+
+    agent = new_agent(Faulty(gym.make(TOY, max_steps=20), at=2 if on_reset else 25, fault=fault, on_reset=on_reset))
+    with pytest.raises(ValueError, match=message):
+        agent.learn(50)
+    agent.save(io.BytesIO())
+    assert agent.learn(50, reset_num_timesteps=False).num_timesteps > 50
+
+
+def test_a_worker_that_has_died_is_called_so(tmp_path: Path) -> None:
+    env = new_vec_env(vec_env_cls=SubprocVecEnv)
+    agent = new_agent(env).learn(40)
+    env.processes[0].kill()  # type: ignore[attr-defined]
+    env.processes[0].join()  # type: ignore[attr-defined]
+    with pytest.warns(UserWarning, match="cannot tell its state"):
+        agent.save(tmp_path / "agent")
+    with pytest.raises(RuntimeError, match="worker process of it, cannot be reached"):
+        agent.learn(20, reset_num_timesteps=False)
+    agent.save(tmp_path / "agent")
+    agent.save_replay_buffer(tmp_path / "replay")
+    agent.set_env(new_vec_env(), force_reset=True)
+    assert agent.learn(20, reset_num_timesteps=False).num_timesteps >= 60
+    env.processes[1].kill()  # type: ignore[attr-defined]
+
+
+def test_a_reward_without_bounds_does_not_matter(tmp_path: Path) -> None:
+    agent = new_agent(gym.wrappers.TransformReward(gym.make(TOY, max_steps=10), lambda _: -np.inf)).learn(50)
+    agent.save(tmp_path / "agent")
+    SkillGraphAgent.load(tmp_path / "agent")
 
 
 # -- Ctrl-C -----------------------------------------------------------------------------------------------------------

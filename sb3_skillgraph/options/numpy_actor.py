@@ -30,7 +30,17 @@ class NumpyActor:
         """
         :param observations: (n, d) float32, or (n, *shape of the observation space)
         :return: (n, a) float32 actions in [-1, 1], as the network gives them
+        :raises ValueError: if it gives NaN
         """
+        actions = self._act(observations)
+        if np.isnan(actions).any():
+            raise ValueError(
+                "The policy's parameters hold NaN or inf: learning has diverged (a smaller learning_rate may help), or they "
+                "were set so."
+            )
+        return actions
+
+    def _act(self, observations: np.ndarray) -> np.ndarray:
         if [parameter.data_ptr() for parameter in self._parameters] != self._addresses:
             self._view()
         if not self._layers:
