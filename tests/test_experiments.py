@@ -8,6 +8,7 @@ import shutil
 import signal
 import subprocess
 import sys
+from collections import Counter
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import Any
@@ -44,7 +45,7 @@ def spec(algorithm: str = "skill_graph", steps: int = 600, **changes: Any) -> Ru
     return RunSpec(algorithm, "toy", algorithm=algorithm, env_id=TOY, steps=steps, **{**values, **changes})
 
 
-def progress(folder: Path) -> list[dict[str, str]]:
+def progress(folder: Path) -> list[dict[str, Any]]:
     return [{name: value for name, value in row.items() if name != "time/seconds"} for row in read_progress(folder)]
 
 
@@ -358,6 +359,26 @@ def test_killed_at_any_moment_it_comes_to_the_same_and_two_workers_share(tmp_pat
         assert (s.folder(shared) / "done.json").exists()
         assert not (s.folder(shared) / "error.txt").exists()
         assert progress(s.folder(shared)) == progress(s.folder(alone))
+
+
+@pytest.mark.parametrize("n_workers", [2, 4])
+def test_workers_share_what_one_of_them_leaves_and_none_minds_a_damaged_folder(tmp_path: Path, n_workers: int) -> None:
+    methods = {"dsg": {"algorithm": "skill_graph", "arguments": SMALL_NETS}}
+    toy = {"id": TOY, "steps": 300, "kwargs": {"max_steps": 60}}
+    file = plan(tmp_path / "plan.yml", methods=methods, environments={"toy": toy}, check_every=100, seeds=[0, 1, 2, 3, 4])
+    specs, out = load_plan(file), tmp_path / "shared"
+    damaged = specs[2].folder(out)
+    damaged.mkdir(parents=True)
+    (damaged / "progress.csv").write_text("half a li")
+    (damaged / "config.json").write_text("")
+    ends = work(file, out, [[("step", 150), *[("step", 0)] * (n_workers - 1)]])
+    assert ends == [[-signal.SIGKILL, *[0] * (n_workers - 1)]]
+    begun = Counter(line.split()[1] for line in (out / "begun.txt").read_text().splitlines())
+    assert sorted(begun.values()) == [1, 1, 1, 2]  # the one that was killed, twice
+    for s in specs:
+        assert (s.folder(out) / "done.json").exists() == (s.folder(out) != damaged)
+    assert "config.json is damaged" in (damaged / "error.txt").read_text()
+    assert Counter(run.state for run in status(specs, out)) == {"done": 4, "failed": 1}
 
 
 @pytest.mark.parametrize(
