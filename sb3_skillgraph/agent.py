@@ -165,7 +165,7 @@ class SkillGraphAgent(OffPolicyAlgorithm):
         self.rules = rules
         self._interrupts = Interrupts()
         self._env_snapshot: dict[str, Any] | None = None
-        self._loaded = ""  # by which update a loaded agent was trained
+        self._loaded: persistence.Loaded | None = None  # until it is put to use
         if self.env is not None:
             self._spec = GoalSpec.of(self.observation_space, self.action_space)
         if _init_setup_model:
@@ -282,7 +282,7 @@ class SkillGraphAgent(OffPolicyAlgorithm):
             self.parts.rng.bit_generator.state = rollout.pending.rng_state
             self._last_obs = None
         resumed = not reset_num_timesteps and persistence.restore_env(self)
-        self._env_snapshot = None
+        self._env_snapshot, self._loaded = None, None
         goes_on = resumed or (not reset_num_timesteps and self._last_obs is not None)
         noise = copy.deepcopy(self.action_noise) if goes_on else None
         total, callback = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
@@ -560,6 +560,9 @@ class SkillGraphAgent(OffPolicyAlgorithm):
         """
         Load an agent; nothing in the file is ever executed. Arguments as SB3 has them.
 
+        As SB3's ``load`` does, it seeds the generators of Python, NumPy and torch if the agent was made with a seed, and
+        leaves them alone otherwise. ``learn(reset_num_timesteps=False)`` sets them to where they were at saving.
+
         :param custom_objects: arguments to use in place of the saved ones, as ``kwargs`` are
         :param force_reset: begin ``learn`` at a fresh episode even if the environments' states were saved (SB3's default
             is to do so; here learning goes on exactly where it was)
@@ -585,4 +588,4 @@ class SkillGraphAgent(OffPolicyAlgorithm):
         refuse_changed_goals(env)
         super().set_env(env, force_reset)
         if force_reset:
-            self._env_snapshot, self._loaded = None, ""
+            self._env_snapshot, self._loaded = None, None

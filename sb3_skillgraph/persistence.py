@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable
 from copy import deepcopy
 from dataclasses import asdict
 from inspect import signature
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
@@ -32,6 +32,17 @@ for _option_class in (OptionDDPG, OptionTD3):
 #: What building and filling an agent raises if it is given something else than was saved.
 UNFIT = (AssertionError, AttributeError, IndexError, KeyError, MemoryError, OverflowError, RuntimeError, TypeError)
 _COUNTERS = ("num_timesteps", "_total_timesteps", "_num_timesteps_at_start", "_episode_num", "_n_updates")
+
+
+class Loaded(NamedTuple):
+    """What a loaded agent needs to go on exactly, and has not put to use yet.
+
+    :param update_path: by which update it was trained
+    :param generators: states of the process's generators
+    """
+
+    update_path: str
+    generators: dict[str, Any]
 
 
 def agent_tree(agent: Any, left_out: Iterable[str]) -> dict[str, Any]:
@@ -85,11 +96,7 @@ def _progress(agent: Any) -> dict[str, Any]:
         "rollout": rollout.get_state(),
         "salience": _told("The salience", salience.get_state) if hasattr(salience, "get_state") else None,
         "rng": agent.parts.rng.bit_generator.state if pending is None else pending.rng_state,
-        "global_generators": {
-            "python": list(random.getstate()),
-            "numpy": np.random.get_state(legacy=False),  # noqa: NPY002 - SB3's own noise draws from it
-            "torch": th.get_rng_state(),
-        },
+        "global_generators": _generators() if agent._loaded is None else agent._loaded.generators,
         "environments": _snapshot(agent),
     }
 
@@ -98,6 +105,22 @@ def _measured(info: dict[str, Any]) -> list[dict[str, float]]:
     """Return what SB3 logs of an episode; nothing if its reward is no number, which means nothing here anyway."""
     measured = {name: float(info[name]) for name in ("r", "l", "t")}
     return [measured] if np.isfinite(list(measured.values())).all() else []
+
+
+def _generators() -> dict[str, Any]:
+    """Return the states of the generators of the process, from which SB3's noise and networks draw."""
+    return {
+        "python": list(random.getstate()),
+        "numpy": np.random.get_state(legacy=False),  # noqa: NPY002
+        "torch": th.get_rng_state(),
+    }
+
+
+def _set_generators(state: dict[str, Any]) -> None:
+    """Set the generators of the process."""
+    random.setstate(tuple(state["python"]))
+    np.random.set_state(state["numpy"])  # noqa: NPY002
+    th.set_rng_state(state["torch"])
 
 
 def _told(who: str, get_state: Callable[[], Any]) -> Any:
@@ -180,7 +203,7 @@ def _build(cls: Any, tree: dict[str, Any], env: Any, device: Any, given: dict[st
     agent._setup_model()
     check_learned(agent, tree, agent.env)
     _restore(agent, tree, same_envs=agent.n_envs == tree["n_envs"] and not force_reset)
-    agent._loaded = tree["update_path"]
+    agent._loaded = Loaded(tree["update_path"], tree["progress"]["global_generators"])
     return agent
 
 
@@ -218,21 +241,11 @@ def _restore(agent: Any, tree: dict[str, Any], same_envs: bool) -> None:
     parts.rollout.set_state(progress["rollout"], same_envs)
     if same_envs:
         agent._env_snapshot = progress["environments"]
-    _set_generators(progress["global_generators"])
-
-
-def _set_generators(state: dict[str, Any]) -> None:
-    """Set the generators of the process; all of them, or none."""
-    before = random.getstate(), np.random.get_state(), th.get_rng_state()  # noqa: NPY002
+    before = _generators()
     try:
-        random.setstate(tuple(state["python"]))
-        np.random.set_state(state["numpy"])  # noqa: NPY002
-        th.set_rng_state(state["torch"])
-    except Exception:
-        random.setstate(before[0])
-        np.random.set_state(before[1])  # noqa: NPY002
-        th.set_rng_state(before[2])
-        raise
+        _set_generators(progress["global_generators"])  # or they are none
+    finally:
+        _set_generators(before)
 
 
 def restore_env(agent: Any) -> bool:
@@ -242,16 +255,18 @@ def restore_env(agent: Any) -> bool:
     :return: whether they were
     """
     snapshot, agent._env_snapshot = agent._env_snapshot, None
-    loaded, agent._loaded = agent._loaded, ""
-    path = _update_path(agent.parts.walker.learner) if loaded else ""
-    if path != loaded:
-        warnings.warn(
-            f"The walker was trained by the {loaded} update and goes on with the {path} update: their numbers differ in the "
-            "last digits, so that learning does not go on exactly as it would have.",
-            stacklevel=5,
-        )
-    if loaded and agent.verbose and snapshot is None:
-        print("The environments' states are not known (no get_state/set_state): learning resumes at a fresh episode.")
+    loaded, agent._loaded = agent._loaded, None
+    if loaded is not None:
+        path = _update_path(agent.parts.walker.learner)
+        if path != loaded.update_path:
+            warnings.warn(
+                f"The walker was trained by the {loaded.update_path} update and goes on with the {path} update: their numbers "
+                "differ in the last digits, so that learning does not go on exactly as it would have.",
+                stacklevel=5,
+            )
+        if agent.verbose and snapshot is None:
+            print("The environments' states are not known (no get_state/set_state): learning resumes at a fresh episode.")
+        _set_generators(loaded.generators)
     if snapshot is None or agent.env is None or not agent.env.has_attr("set_state"):
         return False
     agent.env.reset()

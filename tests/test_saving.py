@@ -2,6 +2,7 @@
 
 import io
 import pathlib
+import random
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -14,6 +15,7 @@ import torch as th
 from conftest import TOY, differences, new_agent, new_vec_env, state_in, state_of
 from stable_baselines3 import SAC
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise, VectorizedActionNoise
+from stable_baselines3.common.utils import set_random_seed
 
 from sb3_skillgraph import SkillGraphAgent
 
@@ -109,6 +111,25 @@ def test_learning_on_without_the_counters(trained_files: tuple[Path, Path]) -> N
 def test_loading_draws_from_no_generator_it_does_not_restore(trained_files: tuple[Path, Path]) -> None:
     first, second = (SkillGraphAgent.load(trained_files[0], env=gym.make(TOY)) for _ in range(2))
     assert differences(state_of(first), state_of(second)) == []
+
+
+@pytest.mark.parametrize("seed", [None, 3])
+def test_loading_does_to_the_generators_what_sb3_does(tmp_path: Path, seed: int | None) -> None:
+    def drawn() -> tuple[float, ...]:
+        return random.random(), np.random.random(), float(th.rand(1))  # noqa: NPY002
+
+    def expected(draw: int) -> tuple[float, ...]:
+        set_random_seed(draw)
+        return drawn()
+
+    agent = new_agent(seed=seed).learn(30)
+    agent.save(tmp_path / "agent")
+    at_saving = [drawn() for _ in range(2)]
+    set_random_seed(8)
+    loaded = SkillGraphAgent.load(tmp_path / "agent", env=gym.make(TOY))
+    assert drawn() == expected(8 if seed is None else seed)
+    loaded.learn(0, reset_num_timesteps=False)
+    assert [drawn() for _ in range(2)] == at_saving
 
 
 # -- arguments --------------------------------------------------------------------------------------------------------
