@@ -24,6 +24,8 @@ from sb3_skillgraph.files import replaced
 from sb3_skillgraph.version import __version__
 
 SCHEMA = 2
+#: Bytes that a file may have to be read. For larger ones, of whom you trust, raise it: ``sb3_skillgraph.saving.MAX_BYTES``.
+MAX_BYTES = 16 * 2**30
 PathOrFile = str | pathlib.Path | io.BufferedIOBase | BinaryIO
 
 _CLASSES: dict[str, type] = {
@@ -249,7 +251,10 @@ def _check_sizes(archive: zipfile.ZipFile) -> None:
     if any(info.compress_type != zipfile.ZIP_STORED for info in infos):
         raise ValueError("its members are compressed")
     archive.fp.seek(0, os.SEEK_END)
-    if len({info.filename for info in infos}) < len(infos) or sum(info.file_size for info in infos) > archive.fp.tell():
+    size = archive.fp.tell()
+    if size > MAX_BYTES:
+        raise ValueError(f"it has {size} bytes; if you trust it, raise sb3_skillgraph.saving.MAX_BYTES ({MAX_BYTES})")
+    if len({info.filename for info in infos}) < len(infos) or sum(info.file_size for info in infos) > size:
         raise ValueError("its members are longer than the file, or have the same name")
 
 

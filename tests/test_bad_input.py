@@ -35,7 +35,7 @@ from stable_baselines3 import DDPG
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
-from sb3_skillgraph import OptionEnv, SkillGraphAgent
+from sb3_skillgraph import OptionEnv, SkillGraphAgent, saving
 from sb3_skillgraph.events import Event
 from sb3_skillgraph.saving import SCHEMA
 
@@ -496,6 +496,31 @@ def test_a_replay_buffer_that_is_refused_leaves_the_old_one(
     with pytest.raises((ValueError, KeyError), match="n_trajectories"):
         trained.load_replay_buffer(with_document(trained_files[1], document))
     assert differences(before, state_of(trained)) == []
+
+
+def test_a_file_beyond_the_limit(
+    trained: SkillGraphAgent, trained_files: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(saving, "MAX_BYTES", 10_000)
+    with pytest.raises(ValueError, match="raise sb3_skillgraph.saving.MAX_BYTES"):
+        SkillGraphAgent.load(trained_files[0])
+    with pytest.raises(ValueError, match="raise sb3_skillgraph.saving.MAX_BYTES"):
+        trained.load_replay_buffer(trained_files[1])
+
+
+def test_files_that_promise_more_than_they_hold(trained_files: tuple[Path, Path]) -> None:
+    for way, value in [
+        (("arguments", "buffer_size"), 10**15),
+        (("arguments", "policy_kwargs"), {"net_arch": [12_000, 12_000]}),
+        (("n_envs",), 5_000),
+    ]:
+        document = document_of(trained_files[0])
+        place = document["tree"]
+        for key in way[:-1]:
+            place = place[key]
+        place[way[-1]] = value
+        with pytest.raises(ValueError):
+            SkillGraphAgent.load(with_document(trained_files[0], document))
 
 
 @pytest.mark.parametrize("name", ["policy_kwargs", "option_kwargs"])
