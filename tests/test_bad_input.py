@@ -502,9 +502,9 @@ def test_a_file_beyond_the_limit(
     trained: SkillGraphAgent, trained_files: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(saving, "MAX_BYTES", 10_000)
-    with pytest.raises(ValueError, match="raise sb3_skillgraph.saving.MAX_BYTES"):
+    with pytest.raises(ValueError, match="MAX_BYTES"):
         SkillGraphAgent.load(trained_files[0])
-    with pytest.raises(ValueError, match="raise sb3_skillgraph.saving.MAX_BYTES"):
+    with pytest.raises(ValueError, match="MAX_BYTES"):
         trained.load_replay_buffer(trained_files[1])
 
 
