@@ -6,12 +6,12 @@ from typing import Any
 import numpy as np
 import torch as th
 
-from sb3_skillgraph.goal_env import HUGE
-
 #: Takes a value and the place where it stands; raises a ValueError that names the place.
 Check = Callable[[Any, str], None]
 #: Whole numbers beyond which nothing is counted.
 MOST = 2**53
+#: Numbers beyond which nobody measures: their squares must fit a float32.
+HUGE = 1e15
 #: Numbers of a network beyond which its first products are infinite, and moments of their gradients.
 LARGEST_WEIGHT, LARGEST_GRADIENT = 1e5, 1e12
 

@@ -7,11 +7,10 @@ import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, is_vecenv_wrapped, unwrap_vec_normalize
 
+from sb3_skillgraph.checking import HUGE
 from sb3_skillgraph.metric import Metric, Product, Rotation, Within, as_metric
 from sb3_skillgraph.options.views import BODY_NUMBERS, View, as_view, body_view, egocentric_view, placed_body_view
 
-#: Numbers beyond which nobody measures: their squares must fit a float32.
-HUGE = 1e15
 KEYS = ("observation", "achieved_goal", "desired_goal")
 
 

@@ -20,6 +20,7 @@ FLOORS: dict[str, float] = {
     "metric": 0,
     "events": 0.5,
     "checking": 0,
+    "files": 0,
     "schema": 9.2,  # what a file may hold
     "saving": 0.5,  # writes the version
     "envs": 1,

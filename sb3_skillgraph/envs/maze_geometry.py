@@ -200,14 +200,26 @@ class MazeGeometry:
         :return: length in world units, infinite when there is no way or an end lies in a wall
         :raises ValueError: when the disc is too wide for a corridor of one cell
         """
+        path = self.shortest_path(a, b, margin)
+        return math.inf if path is None else float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
+
+    def shortest_path(self, a: ArrayLike, b: ArrayLike, margin: float = 0.0) -> NDArray[np.float64] | None:
+        """Shortest way for a disc between two positions; what is said of its length holds for it, too.
+
+        :param a: one end, shape (2,)
+        :param b: other end, shape (2,)
+        :param margin: radius of the disc, less than half a cell
+        :return: the ends and the corners in between, shape (n, 2); None when there is no way or an end lies in a wall
+        :raises ValueError: when the disc is too wide for a corridor of one cell
+        """
         if not 0 <= margin < self.cell_size / 2:
             raise ValueError(f"margin must be at least 0 and less than half the cell size, not {margin!r}")
         start, end = np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64)
         if not self.is_free([start, end]).all():
-            return math.inf
+            return None
         if margin not in self._corner_graphs:
             self._corner_graphs[margin] = _CornerGraph(self._is_wall, self.extent, self.cell_size, margin)
-        return self._corner_graphs[margin].path_length(start, end)
+        return self._corner_graphs[margin].path(start, end)
 
 
 class _CornerGraph:
@@ -242,7 +254,8 @@ class _CornerGraph:
         self._low = np.concatenate([box.min(axis=1) - by for box, by in grown])
         self._high = np.concatenate([box.max(axis=1) + by for box, by in grown])
         lengths = np.array([self._visible_distances(corner) for corner in self._corners]).reshape(2 * (len(corners),))
-        self._between = shortest_path(np.where(np.isfinite(lengths), lengths, 0.0), directed=False)
+        lengths = np.where(np.isfinite(lengths), lengths, 0.0)
+        self._between, self._before = shortest_path(lengths, directed=False, return_predecessors=True)
 
     def _to_xy(self, column_row: NDArray[np.int64]) -> NDArray[np.float64]:
         return self._origin + self._scale * column_row
@@ -266,17 +279,23 @@ class _CornerGraph:
         enter, leave = np.fmin(one, other).max(axis=2), np.fmax(one, other).min(axis=2)
         return ~(np.maximum(enter, 0.0) < np.minimum(leave, 1.0)).any(axis=1)
 
-    def path_length(self, a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
-        """Length of the shortest way.
+    def path(self, a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64] | None:
+        """Shortest way.
 
         :param a: one end, shape (2,)
         :param b: other end, shape (2,)
-        :return: length in world units, infinite when there is no way
+        :return: the ends and the corners in between, shape (n, 2); None when there is no way
         """
         if self._are_visible(a, b[None])[0]:
-            return float(np.linalg.norm(a - b))
+            return np.stack([a, b])
         ways = self._visible_distances(a)[:, None] + self._between + self._visible_distances(b)
-        return float(ways.min(initial=math.inf))
+        if not np.isfinite(ways.min(initial=math.inf)):
+            return None
+        first, corner = np.unravel_index(ways.argmin(), ways.shape)
+        corners = [corner]
+        while corners[-1] != first:
+            corners.append(self._before[first, corners[-1]])
+        return np.concatenate([a[None], self._corners[corners[::-1]], b[None]])
 
 
 def _find_corners(walls: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
