@@ -177,13 +177,14 @@ class Campaign:
         self.seconds = time.perf_counter() - begin
         self.undisturbed = result_of(place / "alone")
 
-    def disturb(self, what: str, fate: Fate | None = None, signals: tuple[int, ...] = (), after: float = 0.0) -> None:
+    def disturb(self, what: str, fate: Fate | None = None, signals: tuple[int, ...] = (), after: float = 0.0) -> bool:
         """Disturb a run, and let the same command go on.
 
         :param what: the disturbance, for people
         :param fate: see :func:`run`
         :param signals: likewise
         :param after: likewise
+        :return: whether it was in time
         """
         folder = self.place / "disturbed"
         shutil.rmtree(folder, ignore_errors=True)
@@ -191,6 +192,7 @@ class Campaign:
         code = run(folder, fate, signals, after)
         self.endings[code] = self.endings.get(code, 0) + 1
         self.failures += [f"{what} (ended with {code}): {fault}" for fault in faults(folder, self.undisturbed)]
+        return code != 0
 
     def at_operations(self, every: int = 1) -> None:
         """Kill at file operations.
@@ -208,9 +210,10 @@ class Campaign:
         """
         rng = np.random.default_rng(seed)
         kinds = [(signal.SIGKILL,), (signal.SIGTERM,), (signal.SIGINT,), (signal.SIGINT, signal.SIGINT)]
-        for i in range(n):
-            after, signals = float(rng.uniform(0.0, self.seconds)), kinds[i % len(kinds)]
-            self.disturb(f"{[s.name for s in signals]} after {after:.3f} s", signals=signals, after=after)
+        in_time = 0
+        while in_time < n:
+            after, signals = float(rng.uniform(0.0, self.seconds)), kinds[in_time % len(kinds)]
+            in_time += self.disturb(f"{[s.name for s in signals]} after {after:.3f} s", signals=signals, after=after)
 
     def out_of_disk(self, n: int) -> None:
         """Let writing fail, from the smallest file to the largest.

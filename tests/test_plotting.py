@@ -17,6 +17,8 @@ from matplotlib.patches import Circle
 
 from sb3_skillgraph import SkillGraphAgent, plotting
 from sb3_skillgraph.choices import EXPECTED
+from sb3_skillgraph.envs import MazeGeometry
+from sb3_skillgraph.envs.maze_geometry import U_MAZE
 from sb3_skillgraph.planning import DIRECT
 from sb3_skillgraph.plotting import event_links, near_links, plot_plan, plot_skill_graph, run_plan, save_figure
 from sb3_skillgraph.plotting.figures import project
@@ -42,10 +44,10 @@ def geometry(env: gym.Env) -> Any:
     return env.get_wrapper_attr("geometry")
 
 
-def links_of(axes: Axes) -> np.ndarray:
+def links_of(axes: Axes) -> list[np.ndarray]:
     collections = [collection for collection in axes.collections if isinstance(collection, LineCollection)]
     assert len(collections) == 1
-    return np.array(collections[0].get_segments())
+    return collections[0].get_segments()
 
 
 # -- the skill graph --------------------------------------------------------------------------------------------------
@@ -62,10 +64,28 @@ def test_one_dot_per_event_and_one_line_per_link(agent: SkillGraphAgent, geometr
     centers = {event.id: event.center for event in agent.events}
     expected = {(*centers[link.source], *centers[link.target]) for link in links}
     assert len(links) == len(links_of(axes)) > len(agent.events)
-    assert {tuple(segment.ravel()) for segment in links_of(axes)} == expected
+    assert {(*line[0], *line[-1]) for line in links_of(axes)} == expected
     summary = agent.graph_summary()
     title = axes.get_title()
     assert f"{summary['events']} events, {summary['salient_events']} of them salient; {summary['edges']} edges" in title
+
+
+def test_no_link_goes_through_a_wall() -> None:
+    geometry = MazeGeometry(U_MAZE)
+    agent = new_agent(gym.make("SkillGraph/PointMazeUMaze-v0"))
+    for center in [(0.9, 0.9), (-0.9, 0.9), (-0.9, -0.9), (0.9, -0.9)]:
+        agent.graph.add_event(np.array(center), salient=False)
+    for source, target in [(0, 1), (1, 2), (3, 2), (1, 3)]:  # the second leads through the wall in the middle
+        for _ in range(3):
+            agent.graph.ran(source, target, True, target, 10.0)
+    lines = links_of(plot_skill_graph(agent, geometry))
+    assert len(lines) == 4 and max(len(line) for line in lines) > 2
+    points = np.concatenate(
+        [a + np.linspace(0, 1, 50)[:, None] * (b - a) for line in lines for a, b in itertools.pairwise(line)]
+    )
+    for x, y, width, height in geometry.walls():
+        low, high = np.array([x, y]) + 1e-6, np.array([x + width, y + height]) - 1e-6
+        assert not ((low < points) & (points < high)).all(axis=1).any()
 
 
 def test_there_is_a_link_for_every_edge_of_the_graph(agent: SkillGraphAgent) -> None:
@@ -160,7 +180,9 @@ def test_every_run_is_drawn_and_the_plan_beside_it(agent: SkillGraphAgent, env: 
         *(e.center for id in plan.path[1:-1:2] for e in agent.events if e.id == id),
         trajectory.goal,
     ]
-    np.testing.assert_allclose(planned.get_xydata(), np.stack(stops))
+    corners = [tuple(point) for point in np.round(planned.get_xydata(), 6).tolist()]  # and those of walls in between
+    at = [corners.index(tuple(stop)) for stop in np.round(np.stack(stops), 6).tolist()]
+    assert at == sorted(at) and (at[0], at[-1]) == (0, len(corners) - 1)
     assert (start.get_label(), goal.get_label()) == ("start", "goal")
     legend = axes.get_legend()
     assert legend is not None

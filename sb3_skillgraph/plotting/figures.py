@@ -63,6 +63,19 @@ def draw_floor(axes: Axes, geometry: MazeGeometry | None, points: np.ndarray, ma
     axes.set_ylabel("y" if geometry is not None else f"goal[1]{note}")
 
 
+def way(geometry: MazeGeometry | None, begin: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """Return the line that stands for a walk: around the corners of a maze, straight elsewhere.
+
+    :param geometry: the maze; None for an environment without one
+    :param begin: shape ``(goal_dim,)``
+    :param end: shape ``(goal_dim,)``
+    :return: shape ``(n, 2)``
+    """
+    ends = project(np.stack([begin, end]))
+    path = None if geometry is None else geometry.shortest_path(*ends)
+    return ends if path is None else path
+
+
 def disc_radius(agent: SkillGraphAgent) -> float:
     """Return the radius of the discs that stand for goals and events in a picture, in goal units.
 

@@ -70,8 +70,8 @@ def plot_skill_graph(agent: SkillGraphAgent, geometry: MazeGeometry | None = Non
     """
     Draw what an agent has discovered: events, and the walks between them, coloured by the success expected of them.
 
-    Of each event the shortest few walks are drawn (:func:`near_links`), as straight lines between the events' centres; the
-    agent goes around corners. Goal spaces of more than two dimensions are drawn by their first two.
+    Of each event the shortest few walks are drawn (:func:`near_links`), as the shortest ways between the events' centres.
+    Goal spaces of more than two dimensions are drawn by their first two.
 
     :param agent: the agent
     :param geometry: the maze, for its walls; None for an environment without one
@@ -81,7 +81,7 @@ def plot_skill_graph(agent: SkillGraphAgent, geometry: MazeGeometry | None = Non
     axes = figures.new_axes() if ax is None else ax
     centers = agent.graph.centers
     figures.draw_floor(axes, geometry, centers if len(centers) else np.zeros((1, 2)), 2 * figures.disc_radius(agent))
-    _draw_links(axes, agent, near_links(event_links(agent)))
+    _draw_links(axes, agent, geometry, near_links(event_links(agent)))
     _draw_events(axes, agent)
     n_salient = sum(event.salient for event in agent.events)
     n_edges = agent.graph.summary()["edges"]
@@ -90,11 +90,11 @@ def plot_skill_graph(agent: SkillGraphAgent, geometry: MazeGeometry | None = Non
     return axes
 
 
-def _draw_links(axes: Axes, agent: SkillGraphAgent, links: list[EventLink]) -> None:
-    centers = {event.id: figures.project(event.center[None])[0] for event in agent.events}
+def _draw_links(axes: Axes, agent: SkillGraphAgent, geometry: MazeGeometry | None, links: list[EventLink]) -> None:
+    centers = {event.id: event.center for event in agent.events}
     # The surest ways last, on top of the others.
     ordered = sorted(links, key=lambda link: link.success_probability)
-    lines = [[centers[link.source], centers[link.target]] for link in ordered]
+    lines = [figures.way(geometry, centers[link.source], centers[link.target]) for link in ordered]
     scale = Normalize(SURE, 1.0)
     colors = [_LINKS(scale(link.success_probability)) for link in ordered]
     axes.add_collection(LineCollection(lines, colors=colors, linewidths=1.1, zorder=figures.Z_LINK))
