@@ -17,6 +17,8 @@ from sb3_skillgraph.memory.store import TransitionStore
 from sb3_skillgraph.metric import Metric, as_metric
 from sb3_skillgraph.options.learner import OptionDDPG, OptionLearner, OptionTD3
 
+#: Steps, or episodes, after which there is training at the latest: ``learn`` does not end before.
+LONGEST_ROLLOUT = 10_000
 NET_ARCH = [128, 128]  # of the walker's networks
 #: Weight, in the loss of ``OptionDDPG``'s and ``OptionTD3``'s actors, of the mean squared norm of what their tanh is given:
 #: keeps them from getting stuck at the bounds of the actions (success on Medium 0.96 with it, 0.61 without).
@@ -52,7 +54,7 @@ _WHOLE: dict[str, tuple[int, int]] = {
     "learning_starts": (0, 2**62),
     "buffer_size": (1, 2**62),
     "batch_size": (1, 2**62),
-    "gradient_steps": (-1, 2**62),
+    "gradient_steps": (-1, 100_000),  # a call of train must end
     "stats_window_size": (1, 2**62),
     "max_events": (8, 2**62),
     "walk_steps": (1, 2**62),
@@ -75,8 +77,8 @@ def check_numbers(arguments: dict[str, Any]) -> None:
                 upper = f"to {high:g}" if high < 1e6 else "on"
                 raise ValueError(f"{name} must be {what} from {low:g} {upper}, not {value!r}.")
     frequency = train_freq[0] if isinstance(train_freq, tuple) else train_freq
-    if isinstance(frequency, int) and frequency < 1:
-        raise ValueError(f"train_freq must be 1 at least, not {train_freq!r}.")
+    if isinstance(frequency, int) and not 1 <= frequency <= LONGEST_ROLLOUT:
+        raise ValueError(f"train_freq must be from 1 to {LONGEST_ROLLOUT}, not {train_freq!r}.")
 
 
 def box(space: spaces.Space) -> spaces.Box:

@@ -14,6 +14,10 @@ MOST = 2**53
 HUGE = 1e15
 #: Numbers of a network beyond which its first products are infinite, and moments of their gradients.
 LARGEST_WEIGHT, LARGEST_GRADIENT = 1e5, 1e12
+#: What Adam keeps of every parameter.
+ADAM_STATE = {"step", "exp_avg", "exp_avg_sq"}
+#: Settings of an optimiser that files of an older torch may lack: torch fills them in.
+TORCH_FILLS = {"amsgrad", "maximize", "foreach", "capturable", "differentiable", "fused", "decoupled_weight_decay", "nesterov"}
 
 
 def refuse(where: str, wanted: str, value: Any) -> None:
@@ -180,7 +184,8 @@ def optimizer_state(optimizer: th.optim.Optimizer) -> Check:
 
     def check_moment(name: str, shape: tuple[int, ...]) -> Check:
         low, high = (0.0, limit**2) if name in ("exp_avg_sq", "max_exp_avg_sq", "square_avg", "step") else (-limit, limit)
-        return optional(tensor(() if name == "step" else shape, low, high))
+        moment = tensor(() if name == "step" else shape, low, high)
+        return moment if name in ADAM_STATE else optional(moment)
 
     def check_one(value: Any, where: str, shape: tuple[int, ...]) -> None:
         dict_of(anything)(value, where)
@@ -197,11 +202,11 @@ def optimizer_state(optimizer: th.optim.Optimizer) -> Check:
             refuse(f"{where}/state", "the same for all parameters", names)
         for i, moments in state.items():
             check_one(moments, f"{where}/state/{i}", shapes[i])
-        if type(optimizer) in (th.optim.Adam, th.optim.AdamW) and state and not {"step", "exp_avg", "exp_avg_sq"} <= names[0]:
+        if type(optimizer) in (th.optim.Adam, th.optim.AdamW) and state and not names[0] >= ADAM_STATE:
             refuse(f"{where}/state", "Adam's: step, exp_avg and exp_avg_sq", names[0])
         for i, (own, given) in enumerate(zip(groups, value["param_groups"], strict=True)):
             entries(True, lr=number(0.0, 1e3), params=one_of(own["params"]))(given, f"{where}/param_groups/{i}")
-            for name in set(own) & set(given) - {"lr", "initial_lr"}:
-                one_of(own[name])(given[name], f"{where}/param_groups/{i}/{name}")
+            for name in set(own) - {"lr", "initial_lr"} - (TORCH_FILLS - set(given)):
+                one_of(own[name])(given.get(name), f"{where}/param_groups/{i}/{name}")
 
     return check

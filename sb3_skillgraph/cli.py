@@ -15,13 +15,22 @@ from rich.table import Table
 
 from sb3_skillgraph.agent import SkillGraphAgent
 from sb3_skillgraph.baselines import RandomWalk, StraightOn
-from sb3_skillgraph.envs import find, geometry_of
+from sb3_skillgraph.envs import geometry_of
 from sb3_skillgraph.evaluation import NoPairsError, PairsResult, Predictor, evaluate_pairs
 from sb3_skillgraph.experiments.commands import add_compare, add_figure, add_status
 from sb3_skillgraph.experiments.console import UserError, assignment, for_people, positive
-from sb3_skillgraph.experiments.run_folder import AGENT, CONFIG, EXPERIENCE, run_config
+from sb3_skillgraph.experiments.opening import (
+    add_agent,
+    add_command,
+    add_env_kwargs,
+    check_env_id,
+    find_run,
+    load_agent,
+    make_env,
+)
+from sb3_skillgraph.experiments.run_folder import EXPERIENCE
 from sb3_skillgraph.experiments.training import train, write_json
-from sb3_skillgraph.hyperparams import check_hyperparams, did_you_mean, load_hyperparams
+from sb3_skillgraph.hyperparams import check_hyperparams, load_hyperparams
 from sb3_skillgraph.plotting import plot_plan, plot_skill_graph, run_plan, save_figure
 from sb3_skillgraph.version import __version__
 
@@ -60,33 +69,8 @@ def build_parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _add_command(commands: Any, name: str, run: Any, summary: str, detail: str) -> argparse.ArgumentParser:
-    command: argparse.ArgumentParser = commands.add_parser(
-        name, help=summary, description=f"{summary}\n\n{detail}", formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    command.set_defaults(run=run)
-    command.add_argument("--seed", type=int, default=0, help="seed of everything random (default: 0)")
-    return command
-
-
-def _add_env_kwargs(command: argparse.ArgumentParser) -> None:
-    command.add_argument(
-        "--env-kwargs",
-        nargs="+",
-        type=assignment,
-        default=[],
-        metavar="NAME=VALUE",
-        help="arguments of the environment, values in YAML: maze_map=[[1,1,1],[1,0,1],[1,1,1]]",
-    )
-
-
-def _add_agent(command: argparse.ArgumentParser) -> None:
-    command.add_argument("agent", type=Path, metavar="RUN", help="folder that train has filled, or an agent.zip")
-    command.add_argument("--env", metavar="ENV", help="environment id (default: that of the run)")
-
-
 def _add_train(commands: Any) -> None:
-    command = _add_command(
+    command = add_command(
         commands,
         "train",
         _train,
@@ -120,11 +104,11 @@ def _add_train(commands: Any) -> None:
         metavar="NAME=VALUE",
         help="arguments of SkillGraphAgent, values in YAML",
     )
-    _add_env_kwargs(command)
+    add_env_kwargs(command)
 
 
 def _add_evaluate(commands: Any) -> None:
-    command = _add_command(
+    command = add_command(
         commands,
         "evaluate",
         _evaluate,
@@ -133,16 +117,15 @@ def _add_evaluate(commands: Any) -> None:
         "experience.zip of the run.\n\n"
         "example:\n  sb3-skillgraph evaluate runs/umaze --pairs 100",
     )
-    _add_agent(command)
+    add_agent(command)
     command.add_argument("--pairs", type=positive, default=100, help="pairs of start and goal (default: 100)")
     command.add_argument("--adapt", type=positive, default=0, metavar="STEPS", help="steps of adaptation per pair")
     command.add_argument("--straight-on", action="store_true", help="without plans: the walker goes straight on to every goal")
     command.add_argument("--out", type=Path, metavar="FILE.json", help="write every pair to this file")
-    _add_env_kwargs(command)
 
 
 def _add_plot(commands: Any) -> None:
-    command = _add_command(
+    command = add_command(
         commands,
         "plot",
         _plot,
@@ -150,13 +133,12 @@ def _add_plot(commands: Any) -> None:
         "OUT receives skill_graph.png and plan.png; --seed chooses start and goal of the plan.\n\n"
         "example:\n  sb3-skillgraph plot runs/umaze --out runs/umaze",
     )
-    _add_agent(command)
+    add_agent(command)
     command.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the pictures")
-    _add_env_kwargs(command)
 
 
 def _add_demo(commands: Any) -> None:
-    command = _add_command(
+    command = add_command(
         commands,
         "demo",
         _demo,
@@ -175,7 +157,7 @@ def _add_demo(commands: Any) -> None:
 
 
 def _train(args: argparse.Namespace) -> int:
-    _check_env_id(args.env)
+    check_env_id(args.env)
     out = args.out or Path("runs") / f"{args.env.rpartition('/')[2]}-seed{args.seed}"
     with for_people():
         given = check_hyperparams(dict(args.hyperparams), "--hyperparams")
@@ -190,10 +172,10 @@ def _train(args: argparse.Namespace) -> int:
 
 
 def _evaluate(args: argparse.Namespace) -> int:
-    path, env_id, env_kwargs = _find_run(args)
-    env = _make_env(env_id, env_kwargs)
+    path, env_id, env_kwargs = find_run(args)
+    env = make_env(env_id, env_kwargs)
     try:
-        agent = _load(path, env)
+        agent = load_agent(path, env)
         if args.adapt:
             _load_experience(agent, path.with_name(EXPERIENCE))
         if args.straight_on and args.adapt:
@@ -213,10 +195,10 @@ def _evaluate(args: argparse.Namespace) -> int:
 
 
 def _plot(args: argparse.Namespace) -> int:
-    path, env_id, env_kwargs = _find_run(args)
-    env = _make_env(env_id, env_kwargs)
+    path, env_id, env_kwargs = find_run(args)
+    env = make_env(env_id, env_kwargs)
     try:
-        agent = _load(path, env)
+        agent = load_agent(path, env)
         env.reset(seed=args.seed)
         _draw(agent, env, args.out)
     finally:
@@ -240,7 +222,7 @@ def _demo(args: argparse.Namespace) -> int:
     write_json(args.out / "results.json", {name: _as_plain(result) for name, result in results.items()})
     # The longest way that succeeded shows the most; failing all, the longest.
     shown = max(results["skill graph"].pairs, key=lambda pair: (pair.success, pair.path_length))
-    env = _make_env(DEMO_ENV, {})
+    env = make_env(DEMO_ENV, {})
     try:
         _draw(agent, env, args.out, shown.start, shown.goal)
     finally:
@@ -250,48 +232,6 @@ def _demo(args: argparse.Namespace) -> int:
 
 
 # -- what the commands share -------------------------------------------------------------------------------------------
-
-
-def _check_env_id(env_id: str) -> None:
-    """Find an environment by its id, importing the package named before a colon."""
-    try:
-        find(env_id)
-    except (gym.error.Error, ImportError) as error:
-        known = [id for id in gym.registry if id.rpartition("/")[0] or "Maze" in id]
-        short = {id.rpartition("/")[2]: id for id in known}
-        hint = did_you_mean(env_id, known) or did_you_mean(env_id.rpartition("/")[2], short)
-        reason = f": {error}" if isinstance(error, ImportError) else ""
-        raise UserError(f"there is no environment {env_id!r}{reason}{hint}.") from error
-
-
-def _find_run(args: argparse.Namespace) -> tuple[Path, str, dict[str, Any]]:
-    """Return the agent's file, and the environment that was asked for, else that of its run."""
-    path = args.agent / AGENT if args.agent.is_dir() else args.agent
-    config: dict[str, Any] = {}
-    if path.with_name(CONFIG).exists():
-        with for_people():
-            config = run_config(path.parent)
-    asked = dict(args.env_kwargs)
-    if args.env is None:
-        if not config:
-            raise UserError(
-                f"{path} was not left there by train (no {CONFIG} beside it): say with --env in which environment."
-            )
-        return path, str(config["env"]), {**config["env_kwargs"], **asked}
-    if config and (args.env, asked) != (config["env"], config["env_kwargs"]):
-        print(f"note: the agent was trained in {config['env']} {config['env_kwargs'] or ''}")
-    return path, str(args.env), asked
-
-
-def _make_env(env_id: str, env_kwargs: dict[str, Any]) -> gym.Env:
-    _check_env_id(env_id)
-    with for_people():
-        return gym.make(env_id, **env_kwargs)
-
-
-def _load(path: Path, env: gym.Env) -> SkillGraphAgent:
-    with for_people():
-        return SkillGraphAgent.load(path, env=env)
 
 
 def _load_experience(agent: SkillGraphAgent, path: Path) -> None:

@@ -29,7 +29,7 @@ from sb3_skillgraph.evaluation import Predictor
 from sb3_skillgraph.experiments.run_folder import AGENT, load_agent, save_agent, stops
 from sb3_skillgraph.hyperparams import check_hyperparams, did_you_mean, load_hyperparams
 from sb3_skillgraph.options.learner import OptionDDPG, OptionTD3
-from sb3_skillgraph.plotting import event_links, near_links
+from sb3_skillgraph.plotting import snapshot
 
 Check = Callable[[int], None]
 GOAL_STEPS = 200  # for which the recipe pursues a goal, as long as an option may run
@@ -181,12 +181,7 @@ class SkillGraphLearner(Learner):
 
     def snapshot(self) -> dict[str, Any]:
         """Return events and what joins them."""
-        numbers = {event.id: i for i, event in enumerate(self.agent.events)}
-        links = near_links(event_links(self.agent))
-        return {
-            "centers": [event.center.tolist() for event in self.agent.events],
-            "links": [[numbers[link.source], numbers[link.target]] for link in links],
-        }
+        return snapshot(self.agent)
 
 
 class StraightOnLearner(SkillGraphLearner):

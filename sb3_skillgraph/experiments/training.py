@@ -38,11 +38,12 @@ from sb3_skillgraph.experiments.run_folder import (
     take_checkpoint,
 )
 from sb3_skillgraph.files import write_text
+from sb3_skillgraph.plotting import snapshot
 from sb3_skillgraph.rules import PaperRules
 
 CHECKPOINT_EVERY = 10_000  # environment steps
 STOP_EVERY = 500  # environment steps, after which a run can be stopped: Ctrl-C waits for them
-N_LINES = 10  # of progress, where nobody looks at a bar
+N_LOOKS = 10  # at the graph: what is seen of it is kept, and told where nobody looks at a bar
 
 
 def train(
@@ -67,6 +68,7 @@ def train(
     :param steps: environment steps in all
     :param seed: of everything random
     :param out: receives ``agent.zip`` and ``experience.zip`` (when interrupted, too), ``progress.csv``, ``config.json``,
+        ``graph_N.json`` (what is seen of the graph after N steps),
         until the end the newest checkpoints, and then ``done.json``
     :param n_envs: copies of the environment
     :param device: torch device
@@ -142,8 +144,10 @@ def _learn(agent: SkillGraphAgent, begin: int, steps: int, out: Path, elapsed: f
             for target in stops(begin, steps, min(STOP_EVERY, CHECKPOINT_EVERY)):
                 # By what was asked for: a call of several environments may overshoot, and the next makes up for it.
                 agent.learn(target - begin, callback=callbacks, reset_num_timesteps=False)
-                if bar is None and target * N_LINES // steps > begin * N_LINES // steps:
-                    _print_line(agent, steps)
+                if target * N_LOOKS // steps > begin * N_LOOKS // steps:
+                    write_text(out / f"graph_{target}.json", json.dumps({"steps": target, **snapshot(agent)}) + "\n")
+                    if bar is None:
+                        _print_line(agent, steps)
                 begin = target
                 if target < steps and (target % CHECKPOINT_EVERY == 0 or is_asked_to_stop()):
                     take_checkpoint(out, target, lambda folder: _save(agent, out, folder))

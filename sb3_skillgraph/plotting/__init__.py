@@ -2,6 +2,6 @@
 
 from sb3_skillgraph.plotting.figures import save_figure
 from sb3_skillgraph.plotting.plan import Trajectory, plot_plan, run_plan
-from sb3_skillgraph.plotting.skill_graph import event_links, near_links, plot_skill_graph
+from sb3_skillgraph.plotting.skill_graph import event_links, near_links, plot_skill_graph, snapshot
 
-__all__ = ["Trajectory", "event_links", "near_links", "plot_plan", "plot_skill_graph", "run_plan", "save_figure"]
+__all__ = ["Trajectory", "event_links", "near_links", "plot_plan", "plot_skill_graph", "run_plan", "save_figure", "snapshot"]

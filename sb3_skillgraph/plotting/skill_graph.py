@@ -1,6 +1,6 @@
 """The skill graph as a picture over the maze (the paper's Figure 4)."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib import colormaps
@@ -64,6 +64,19 @@ def near_links(links: list[EventLink]) -> list[EventLink]:
         by_source.setdefault(link.source, []).append(link)
     kept = {(link.source, link.target) for few in by_source.values() for link in few[:NEAREST]}
     return [link for link in sure if (link.source, link.target) in kept]
+
+
+def snapshot(agent: SkillGraphAgent) -> dict[str, Any]:
+    """Return what is seen of a graph as plain data: where its events are, and which of them walks join.
+
+    :param agent: the agent
+    """
+    numbers = {event.id: i for i, event in enumerate(agent.events)}
+    links = near_links(event_links(agent))
+    return {
+        "centers": [event.center.tolist() for event in agent.events],
+        "links": [[numbers[link.source], numbers[link.target]] for link in links],
+    }
 
 
 def plot_skill_graph(agent: SkillGraphAgent, geometry: MazeGeometry | None = None, ax: Axes | None = None) -> Axes:
