@@ -19,6 +19,8 @@ from sb3_skillgraph.options.learner import OptionDDPG, OptionLearner, OptionTD3
 
 #: Steps, or episodes, after which there is training at the latest: ``learn`` does not end before.
 LONGEST_ROLLOUT = 10_000
+#: Learning rates beyond which any network diverges.
+FASTEST = 10.0
 NET_ARCH = [128, 128]  # of the walker's networks
 #: Weight, in the loss of ``OptionDDPG``'s and ``OptionTD3``'s actors, of the mean squared norm of what their tanh is given:
 #: keeps them from getting stuck at the bounds of the actions (success on Medium 0.96 with it, 0.61 without).
@@ -76,6 +78,9 @@ def check_numbers(arguments: dict[str, Any]) -> None:
             if isinstance(value, bool) or not isinstance(value, kinds) or not low <= value <= high:
                 upper = f"to {high:g}" if high < 1e6 else "on"
                 raise ValueError(f"{name} must be {what} from {low:g} {upper}, not {value!r}.")
+    rate = arguments["learning_rate"]
+    if not callable(rate) and not (isinstance(rate, int | float) and 0 <= rate <= FASTEST):
+        raise ValueError(f"learning_rate must be a number from 0 to {FASTEST}, or a schedule, not {rate!r}.")
     frequency = train_freq[0] if isinstance(train_freq, tuple) else train_freq
     if isinstance(frequency, int) and not 1 <= frequency <= LONGEST_ROLLOUT:
         raise ValueError(f"train_freq must be from 1 to {LONGEST_ROLLOUT}, not {train_freq!r}.")

@@ -1,4 +1,4 @@
-"""The command line: ``sb3-skillgraph train | evaluate | plot | demo | compare | status | figure``."""
+"""The command line: ``sb3-skillgraph train | evaluate | plot | explore | export | video | demo | compare | ...``."""
 
 import argparse
 import sys
@@ -30,6 +30,7 @@ from sb3_skillgraph.experiments.opening import (
 )
 from sb3_skillgraph.experiments.run_folder import EXPERIENCE
 from sb3_skillgraph.experiments.training import train, write_json
+from sb3_skillgraph.explore.commands import add_explore, add_export, add_video
 from sb3_skillgraph.hyperparams import check_hyperparams, load_hyperparams
 from sb3_skillgraph.plotting import plot_plan, plot_skill_graph, run_plan, save_figure
 from sb3_skillgraph.version import __version__
@@ -66,6 +67,9 @@ def build_parser() -> argparse.ArgumentParser:
     add_compare(commands)
     add_status(commands)
     add_figure(commands)
+    add_explore(commands)
+    add_export(commands)
+    add_video(commands)
     return parser
 
 

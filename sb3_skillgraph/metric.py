@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from sb3_skillgraph.checking import HUGE
+
 #: Radii by which goals are apart, beside all else, for every dimension that has to match and does not: no event is so large.
 MISMATCH = 1_000.0
 #: Values of a dimension that has to match are the same up to this difference: whole numbers are told apart.
@@ -362,7 +364,7 @@ def _part(kind: str, **arguments: Any) -> Part:
 
 
 def _positive(radius: Any) -> float:
-    if isinstance(radius, bool) or not isinstance(radius, int | float | np.number) or not 0 < radius < np.inf:
+    if isinstance(radius, bool) or not isinstance(radius, int | float | np.number) or not 0 < radius <= HUGE:
         raise ValueError(f"event_radius must be a positive number, or a metric, not {radius!r}.")
     return float(radius)
 

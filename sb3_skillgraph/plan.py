@@ -58,6 +58,24 @@ def describe(runner: Runner, state: RunnerState, point: np.ndarray, goal: np.nda
     first = solution.first() if start.towards == NOWHERE else solution.leading_to(start.towards)
     # A running option has taken some of its steps already.
     remaining = max(runner.planner.horizon - float(state.elapsed[0] - state.steps[0]), 1.0)
+    return _beginning_with(runner, solution, first, goal, remaining)
+
+
+def next_best(runner: Runner, point: np.ndarray, goal: np.ndarray) -> Plan | None:
+    """Make the plan that would be the best if it were not for the first option of the one that is followed.
+
+    :param runner: runs options
+    :param point: where the agent stands at the start of an episode, shape ``(goal_dim,)``
+    :param goal: shape ``(goal_dim,)``
+    :return: the plan; None if there is nothing else to begin with
+    """
+    state = RunnerState.fresh(1, len(point), 0)
+    solution = runner.decide(state, 0, runner.start(state, 0, point), goal, PESSIMISTIC)
+    other = solution.second()
+    return None if other is None else _beginning_with(runner, solution, other, goal, float(runner.planner.horizon))
+
+
+def _beginning_with(runner: Runner, solution: Solution, first: int, goal: np.ndarray, remaining: float) -> Plan:
     probability, steps = runner.planner.promise(solution, first, remaining)
     return Plan(_status(runner, goal), _ids(runner, solution, runner.planner.path(solution, first)), steps, probability)
 

@@ -131,6 +131,12 @@ class Solution(NamedTuple):
         direct = cheapest[self.episode.target[cheapest] == self.goal]
         return int(direct[0] if len(direct) else cheapest[0])
 
+    def second(self) -> int | None:
+        """Return the row of the cheapest option at the start that leads elsewhere than the first one; None if none does."""
+        first = self.episode.target[self.first()]
+        rows = np.flatnonzero((self.episode.source == self.start) & (self.episode.target != first))
+        return int(rows[self.episode_costs[rows].argmin()]) if len(rows) else None
+
     def leading_to(self, target: int) -> int:
         """Return the row, among those of the episode, of the choice at the start that leads to a vertex."""
         return int(np.flatnonzero((self.episode.source == self.start) & (self.episode.target == target))[0])

@@ -231,7 +231,7 @@ def _rollout(n_envs: int, spec: Any, n_events: int, n_matched: int) -> Check:
     event, passed = whole(0, max(n_events - 1, 0)), each(whole(), number(0.0), kind=tuple)
     stay = each(event, whole(), whole(), number(0.0), _some(list_of(passed)))
     return entries(
-        runner=each(*(_like(column) for column in fresh), kind=tuple),
+        runner=each(*(_like(name, column) for name, column in zip(fresh._fields, fresh, strict=True)), kind=tuple),
         held=array((n_envs, spec.action_dim), low=-1.0, high=1.0),
         hold_left=array((n_envs,), "i", 0, MOST),
         n_stuck=whole(),
@@ -265,10 +265,9 @@ def _mt19937(value: Any, where: str) -> None:
         refuse(f"{where}/state/key", "a state", value["state"]["key"])
 
 
-def _like(column: np.ndarray) -> Check:
-    """Check an array of the shape and kind of another one; what counts and lasts is not negative."""
-    low = 0.0 if column.dtype.kind == "f" and column.ndim == 1 else -HUGE
-    return array(column.shape, column.dtype.kind, low)
+def _like(name: str, column: np.ndarray) -> Check:
+    """Check an array of a runner's state, which has the shape and kind of another one; what counts is not negative."""
+    return array(column.shape, column.dtype.kind, -HUGE if name in ("aim", "seen") else 0.0)
 
 
 def _some(check: Check) -> Check:

@@ -17,7 +17,7 @@ FLOORS: dict[str, float] = {
     "interrupts": 0,
     "rules": 0,  # numbers
     "vec_env": 0,
-    "metric": 0,
+    "metric": 0.1,  # knows how large numbers may be
     "events": 0.5,
     "checking": 0,
     "files": 0,
@@ -48,6 +48,7 @@ FLOORS: dict[str, float] = {
     "baselines": 13,
     "plotting": 13,
     "experiments": 14,
+    "explore": 14.5,
     "cli": 15,
     "__main__": 16,
     "__init__": 16,

@@ -86,7 +86,7 @@ def plot_plan(
     """
     axes = figures.new_axes() if ax is None else ax
     figures.draw_floor(axes, geometry, np.vstack([trajectory.points, trajectory.goal]), 2 * figures.disc_radius(agent))
-    _draw_planned(axes, agent, geometry, trajectory, plan)
+    draw_planned(axes, agent, geometry, trajectory, plan)
     _draw_runs(axes, agent, trajectory)
     start, goal = figures.project(np.stack([trajectory.points[0], trajectory.goal]))
     axes.plot(*start, "o", color=_START_COLOR, markersize=10, markeredgecolor="white", zorder=figures.Z_LABEL, label="start")
@@ -103,10 +103,17 @@ def plot_plan(
     return axes
 
 
-def _draw_planned(
+def draw_planned(
     axes: Axes, agent: SkillGraphAgent, geometry: MazeGeometry | None, trajectory: Trajectory, plan: Plan
 ) -> None:
-    """Draw the plan from event to event."""
+    """Draw a plan from event to event.
+
+    :param axes: where to draw
+    :param agent: the agent
+    :param geometry: the maze; None for an environment without one
+    :param trajectory: its start and goal are those of the plan
+    :param plan: the plan
+    """
     events = {event.id: event for event in agent.events}
     planned = [events[id] for id in plan.path if id in events]
     stops = [trajectory.points[0], *(event.center for event in planned), trajectory.goal]

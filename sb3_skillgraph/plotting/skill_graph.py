@@ -7,7 +7,7 @@ from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
-from matplotlib.colors import LinearSegmentedColormap, Normalize
+from matplotlib.colors import LinearSegmentedColormap, Normalize, to_hex
 from matplotlib.lines import Line2D
 
 from sb3_skillgraph.agent import SkillGraphAgent
@@ -20,6 +20,14 @@ _LINKS = LinearSegmentedColormap.from_list("links", colormaps["plasma"](np.linsp
 SURE = 0.5
 #: The walks of an event that are drawn: more only blacken the picture.
 NEAREST = 4
+
+
+_SCALE = Normalize(SURE, 1.0)
+
+
+def link_color(success_probability: float) -> str:
+    """Return the colour of a walk, by the success that is expected of it."""
+    return to_hex(_LINKS(_SCALE(success_probability)))
 
 
 class EventLink(NamedTuple):
@@ -108,12 +116,11 @@ def _draw_links(axes: Axes, agent: SkillGraphAgent, geometry: MazeGeometry | Non
     # The surest ways last, on top of the others.
     ordered = sorted(links, key=lambda link: link.success_probability)
     lines = [figures.way(geometry, centers[link.source], centers[link.target]) for link in ordered]
-    scale = Normalize(SURE, 1.0)
-    colors = [_LINKS(scale(link.success_probability)) for link in ordered]
+    colors = [link_color(link.success_probability) for link in ordered]
     axes.add_collection(LineCollection(lines, colors=colors, linewidths=1.1, zorder=figures.Z_LINK))
     figure = axes.get_figure(root=False)
     assert figure is not None
-    figure.colorbar(ScalarMappable(scale, _LINKS), ax=axes, shrink=0.6, label="success expected")
+    figure.colorbar(ScalarMappable(_SCALE, _LINKS), ax=axes, shrink=0.6, label="success expected")
 
 
 def _draw_events(axes: Axes, agent: SkillGraphAgent) -> None:

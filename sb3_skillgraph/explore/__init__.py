@@ -1,0 +1,1 @@
+"""Looking at an agent: a page to click on, files for other programs, videos."""
