@@ -1,11 +1,11 @@
-# Two commands set everything up: `make demo` to see it work, `make test` to check it.
+# Two commands set everything up: `make demo` to see it work, `make test` to check it. `make explore` shows a trained agent.
 PYTHON ?= python3
 BIN := .venv/bin
 
 # Networks this small are faster on one torch thread; the other cores are for other processes.
 export OMP_NUM_THREADS := 1
 
-.PHONY: install demo test
+.PHONY: install demo explore test
 
 install: .venv/installed
 
@@ -20,8 +20,11 @@ install: .venv/installed
 demo: install
 	$(BIN)/sb3-skillgraph demo --out runs/demo
 
+explore: install
+	$(BIN)/sb3-skillgraph explore examples/agents/point_medium
+
 test: install
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	$(BIN)/pytest -n 2 --dist loadfile
+	$(BIN)/pytest -n 2 --dist loadfile -m "not browser"

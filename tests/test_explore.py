@@ -73,7 +73,7 @@ def test_a_picture_has_all_events_and_the_short_walks(scene: Scene, trained: Ski
     plan, progress = session.plan(), list(session.go())[-1]
     layers = [scene.floor(), scene.graph(), scene.plan(START, END, plan.path), scene.ends(START, END)]
     picture = ElementTree.fromstring(scene.document(*layers, scene.trace(progress.points, progress.options)))
-    tags = [element.tag.rpartition("}")[2] for element in picture]
+    tags = [element.tag.rpartition("}")[2] for element in picture.iter()]
     ids = [element.get("id") for element in picture if element.get("id")]
     assert ids == [event.id for event in trained.events]
     n_runs = sum(one != other for one, other in zip(["", *progress.options], progress.options, strict=False))

@@ -152,6 +152,8 @@ def test_the_exported_page_needs_no_network(browser: Any, tmp_path: Path) -> Non
     env = gym.make("SkillGraph/PointMazeMedium-v0")
     agent = SkillGraphAgent.load(AGENTS / "point_medium" / "agent.zip", env=env)
     export(agent, tmp_path / "graph.html", geometry_of(env))
+    browser.get("about:blank")  # so that no other page asks for anything any more
+    time.sleep(1.0)
     browser.get_log("performance")
     browser.get((tmp_path / "graph.html").as_uri())
     browser.find_element(BY_CSS, f"circle[id='{agent.events[3].id}']").click()
@@ -159,5 +161,5 @@ def test_the_exported_page_needs_no_network(browser: Any, tmp_path: Path) -> Non
     requests = [
         entry["message"] for entry in browser.get_log("performance") if 'Network.requestWillBeSent"' in entry["message"]
     ]
-    assert all("graph.html" in request for request in requests)
+    assert all("graph.html" in request for request in requests), requests
     browser.save_screenshot(str(SHOTS / "export.png"))

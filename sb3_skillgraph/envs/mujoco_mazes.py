@@ -183,12 +183,27 @@ class AntMazeEnv(MujocoMazeTask, ant_maze_v5.AntMazeEnv):
                 include_cfrc_ext_in_observation=False,
             )
         self.model.actuator_gear[:, 0] = torque
+        self._look_at(geometry)
         self._init_task(geometry, success_radius, max_steps, terminate_on_success)
         self.metadata = {**self.metadata, "render_fps": round(1.0 / self.ant_env.dt)}
         self.tell_stuck = tell_stuck
         EzPickle.__init__(
             self, maze_map, render_mode, success_radius, max_steps, terminate_on_success, torque, frame_skip, tell_stuck
         )
+
+    def _look_at(self, geometry: MazeGeometry) -> None:
+        """Let pictures show the whole maze: gymnasium-robotics' stand where the ant is not."""
+        renderer = self.ant_env.mujoco_renderer
+        left, right, bottom, top = geometry.extent
+        middle = np.array([(left + right) / 2, (bottom + top) / 2, 0.0])
+        # A free camera, which is what -1 means there.
+        renderer.camera_id = -1
+        renderer.default_cam_config = {
+            "lookat": middle,
+            "distance": 1.05 * max(right - left, top - bottom),
+            "azimuth": 90.0,
+            "elevation": -65.0,
+        }
 
     @property
     def _simulator(self) -> MujocoEnv:

@@ -87,15 +87,12 @@ class Scene:
     def floor(self) -> str:
         """Draw the walls."""
         width, height = self.frame.size
-        parts = [f'<rect width="{width}" height="{height}" fill="white"/>']
+        parts = [f'<rect width="{width}" height="{height}" fill="white"/><g fill="{WALL}" shape-rendering="crispEdges">']
         for x, y, w, h in self.geometry.walls() if self.geometry is not None else ():
             (left, top), (right, bottom) = self.frame.pixels(np.array([[x, y + h], [x + w, y]])).tolist()
-            # A hair more, against hairlines between neighbouring cells.
-            parts.append(
-                f'<rect x="{left:.1f}" y="{top:.1f}" width="{right - left + 0.5:.1f}" height="{bottom - top + 0.5:.1f}" '
-                f'fill="{WALL}"/>'
-            )
-        return "".join(parts)
+            size = f'width="{right - left:.1f}" height="{bottom - top:.1f}"'
+            parts.append(f'<rect x="{left:.1f}" y="{top:.1f}" {size}/>')
+        return "".join([*parts, "</g>"])
 
     def graph(self) -> str:
         """Draw the events, and of each the shortest few walks, by the success that is expected of them."""
