@@ -1,11 +1,12 @@
-# Two commands set everything up: `make demo` to see it work, `make test` to check it. `make explore` shows a trained agent.
+# Two commands set everything up: `make demo` to see it work, `make test` to check it. `make explore` shows a trained agent,
+# `make docs` builds the documentation.
 PYTHON ?= python3
 BIN := .venv/bin
 
 # Networks this small are faster on one torch thread; the other cores are for other processes.
 export OMP_NUM_THREADS := 1
 
-.PHONY: install demo explore test
+.PHONY: install demo docs explore test
 
 install: .venv/installed
 
@@ -19,6 +20,12 @@ install: .venv/installed
 
 demo: install
 	$(BIN)/sb3-skillgraph demo --out runs/demo
+
+docs: install
+	$(BIN)/pip install --disable-pip-version-check -q -c constraints.txt -e ".[docs]"
+	$(BIN)/sphinx-build -W --keep-going -q -b html docs docs/_build/html
+	$(BIN)/sphinx-build -W --keep-going -q -b doctest docs docs/_build/doctest
+	@echo "the pages are docs/_build/html/index.html"
 
 explore: install
 	$(BIN)/sb3-skillgraph explore examples/agents/point_medium

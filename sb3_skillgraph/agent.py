@@ -448,6 +448,16 @@ class SkillGraphAgent(OffPolicyAlgorithm):
         :param state: what the last :meth:`predict` returned; None at the start of an episode
         :return: which of the paper's three cases holds, the path, and what it promises
         :raises ValueError: if the goal is not a finite vector of goal space, or there are several environments
+
+        >>> env = gym.make("SkillGraph/ToyMaze-v0")
+        >>> agent = SkillGraphAgent("MultiInputPolicy", env, seed=0).learn(300)
+        >>> observation, _ = env.reset(options={"start": [-1.0, 1.0], "goal": [1.0, 1.0]})
+        >>> plan = agent.plan(observation)
+        >>> plan.path[-1]
+        'goal'
+        >>> _, state = agent.predict(observation)
+        >>> agent.running(state) == [plan.path[0]]
+        True
         """
         batch, _ = as_batch(obs, self.observation_space)
         if len(batch["achieved_goal"]) != 1:

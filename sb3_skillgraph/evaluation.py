@@ -220,6 +220,12 @@ def evaluate_pairs(
     :return: success rate, interval and every pair
     :raises ValueError: if it is no goal environment, or does not tell when a goal is reached
     :raises NoPairsError: if it is a maze that is too small
+
+    >>> from sb3_skillgraph.baselines import RandomWalk
+    >>> env = gym.make("SkillGraph/ToyMaze-v0", max_steps=50)
+    >>> result = evaluate_pairs(RandomWalk(env.action_space, seed=0), env, n_pairs=5)
+    >>> len(result.pairs), 0.0 <= result.success_rate <= 1.0
+    (5, True)
     """
     if n_pairs < 1:
         raise ValueError(f"n_pairs must be 1 at least, not {n_pairs!r}.")

@@ -252,6 +252,12 @@ class SkillGraph:
 
         Edges from an event to a walk carry the record of the walk's runs from there; edges from a walk to an event the
         share of its runs that landed there, wherever they began.
+
+        >>> graph = SkillGraph(goal_dim=2, metric=0.5, max_events=100)
+        >>> home, door = (graph.add_event(np.array(center), salient=False) for center in ([0.0, 0.0], [1.0, 0.0]))
+        >>> graph.ran(home, door, True, door, 12.0)
+        >>> list(graph.nx.edges)
+        [('e0', 'w1'), ('w1', 'e1')]
         """
         if self._nx is None or self._nx[0] != self.version:
             self._nx = (self.version, self._build_nx())

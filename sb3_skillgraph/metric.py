@@ -244,6 +244,12 @@ class Product(Metric):
 
     :param parts: the parts
     :raises ValueError: if there are none that can be measured, or two have a dimension in common
+
+    >>> metric = Product(Within([0, 1], 0.5), Angle([2], 0.2), Exact([3]))
+    >>> round(float(metric.travel(np.array([0.0, 0.0, 3.1, 1.0]), np.array([0.0, 0.0, -3.1, 1.0]))), 2)
+    0.42
+    >>> metric.reached(np.array([0.0, 0.0, 0.0, 0.0]), np.array([0.0, 0.0, 0.0, 1.0]))  # the key has not been fetched
+    False
     """
 
     radius = 1.0
@@ -347,6 +353,12 @@ def as_metric(given: Any) -> Metric:
     :param given: a metric, or what one is made of: a radius; a radius for each dimension (infinite where it does not matter);
         a function ``(a, b) -> distance`` in radii; or what ``get_state`` returned
     :raises ValueError: if it is none of these
+
+    >>> as_metric(0.45).reached(np.array([0.0, 0.0]), np.array([0.3, 0.3]))
+    True
+    >>> heading = as_metric([0.1, np.inf])  # the second dimension does not matter
+    >>> heading.reached(np.array([0.0, 5.0]), np.array([0.05, -5.0]))
+    True
     """
     if isinstance(given, Metric):
         return given

@@ -1,10 +1,13 @@
 """The pages that say what the algorithm does name functions that exist."""
 
+import doctest
 import importlib
 import pkgutil
 import re
 from pathlib import Path
 
+import gymnasium as gym
+import numpy as np
 import pytest
 
 import sb3_skillgraph
@@ -28,3 +31,11 @@ def test_the_page_names_many_functions() -> None:
 @pytest.mark.parametrize(("owner", "name"), NAMED)
 def test_a_named_function_exists(owner: str, name: str) -> None:
     assert hasattr(classes()[owner], name)
+
+
+@pytest.mark.parametrize("module", ["agent", "evaluation", "graph", "metric", "options.env", "smdp.options_env"])
+def test_the_examples_in_docstrings_hold(module: str) -> None:
+    names = {"gym": gym, "np": np, **{name: getattr(sb3_skillgraph, name) for name in sb3_skillgraph.__all__}}
+    tested = importlib.import_module(f"sb3_skillgraph.{module}")
+    result = doctest.testmod(tested, extraglobs=names, optionflags=doctest.NORMALIZE_WHITESPACE)
+    assert result.attempted > 0 and result.failed == 0

@@ -31,6 +31,11 @@ class OptionEnv(gym.Wrapper):
     :param option_view: what the policy sees, as :class:`~sb3_skillgraph.SkillGraphAgent` takes it; by default what the
         environment names as its ``option_view``, else ``"relative"``
     :raises ValueError: if the environment is no goal environment, the goal has the wrong shape, or the view is unknown
+
+    >>> option = OptionEnv(gym.make("SkillGraph/ToyMaze-v0"), Event("corner", np.array([1.0, 1.0]), 0.3))
+    >>> observation, info = option.reset(seed=0)
+    >>> option.observation_space.contains(observation)
+    True
     """
 
     def __init__(

@@ -47,6 +47,15 @@ class OptionsEnv(gym.Wrapper):
     :param timeout: environment steps an option may run; the global option, half of them. An agent's walks have times of
         their own
     :raises ValueError: if the environment is no goal environment, nothing can always be done, or there is too little room
+
+    >>> env = gym.make("SkillGraph/ToyMaze-v0")
+    >>> agent = SkillGraphAgent("MultiInputPolicy", env, seed=0).learn(300)
+    >>> options = OptionsEnv(env, agent.options)
+    >>> observation, _ = options.reset(seed=0)
+    >>> can_run = np.flatnonzero(observation["action_mask"])
+    >>> _, reward, _, _, info = options.step(can_run[0])
+    >>> info["tau"] >= 1
+    True
     """
 
     def __init__(
