@@ -1,6 +1,7 @@
 """The examples run as they are, with fewer steps; so do the benchmarks that nothing else runs."""
 
 import importlib
+import json
 import re
 import runpy
 import sys
@@ -38,6 +39,19 @@ def test_own_environment(monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> No
     printed = capsys.readouterr().out
     assert " events, " in printed and " edges" in printed
     assert re.search(r"success rate: [01]\.\d\d", printed)
+
+
+def test_the_notebook_runs_and_shows_what_it_showed(monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
+    notebook = json.loads((EXAMPLES / "looking.ipynb").read_text())
+    monkeypatch.chdir(EXAMPLES)
+    names: dict[str, object] = {}
+    for cell in notebook["cells"]:
+        if cell["cell_type"] != "code":
+            continue
+        lines = [line for line in cell["source"] if not line.startswith("%")]  # Jupyter's own commands
+        exec("".join(lines), names)
+        shown = "".join(line for output in cell["outputs"] for line in output.get("text", []))
+        assert capsys.readouterr().out == shown
 
 
 class Darkness:
