@@ -2,6 +2,7 @@
 
 import json
 import re
+import socket
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -156,6 +157,17 @@ def test_a_record_tells_of_runs_and_where_they_landed(trained: SkillGraphAgent) 
     assert option["option"] == graph.walk_ids[int(edges.target[row])]
     assert option["succeeded"] == round(float(edges.successes[row]), 1)
     assert re.fullmatch(r"(e\d+ \d+%(, )?)+", option["lands in"])
+    reached_by = record_of(trained, target)["reached_by"]
+    assert reached_by.startswith(f"{option['option']} can begin in ") and source.id in re.findall(r"e\d+", reached_by)
+
+
+def test_a_port_that_is_taken(trained_files: tuple[Path, Path], capsys: Capture) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        assert cli.main(["explore", str(trained_files[0]), "--env", TOY, "--port", str(port), "--no-browser"]) == 2
+    assert f"port {port} cannot be had" in capsys.readouterr().err
 
 
 # -- files ------------------------------------------------------------------------------------------------------------

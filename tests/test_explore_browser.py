@@ -157,7 +157,7 @@ def test_the_exported_page_needs_no_network(browser: Any, tmp_path: Path) -> Non
     browser.get_log("performance")
     browser.get((tmp_path / "graph.html").as_uri())
     browser.find_element(BY_CSS, f"circle[id='{agent.events[3].id}']").click()
-    assert "options that begin here" in text_of(browser)
+    assert "Options that begin here" in text_of(browser)
     requests = [
         entry["message"] for entry in browser.get_log("performance") if 'Network.requestWillBeSent"' in entry["message"]
     ]

@@ -2,6 +2,7 @@
 
 import argparse
 import os
+import socket
 import sys
 from pathlib import Path
 from typing import Any
@@ -91,6 +92,7 @@ def _explore(args: argparse.Namespace) -> int:
         from sb3_skillgraph.explore import page
     except ImportError as error:
         raise UserError(f"explore needs the package {error.name}: pip install 'sb3_skillgraph[explore]'.") from error
+    _check_port(args.port)
     path, env_id, env_kwargs = find_run(args)
     agent = load_agent(path, rendered(env_id, env_kwargs))
     with for_people():
@@ -99,6 +101,15 @@ def _explore(args: argparse.Namespace) -> int:
     shown = page.Shown(agent, lambda: rendered(env_id, env_kwargs), snapshots, f"{env_id}: {path.parent.name}")
     page.serve(shown, args.port, not args.no_browser)
     return 0
+
+
+def _check_port(port: int) -> None:
+    with socket.socket() as tried:
+        tried.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            tried.bind(("127.0.0.1", port))
+        except (OSError, OverflowError) as error:
+            raise UserError(f"port {port} cannot be had ({error}): choose another one with --port.") from error
 
 
 def _export(args: argparse.Namespace) -> int:

@@ -139,6 +139,7 @@ class Page:
         if self.renders:
             self.view.set_source(as_jpeg(np.asarray(self.env.render())))
         self.record = ui.label().classes("text-weight-bold")
+        self.reached_by = ui.label().classes("text-caption")
         self.table = ui.table(rows=[], columns=[], pagination=8).props("dense flat").style("width: 32rem")
         self.table.set_visibility(False)
 
@@ -178,10 +179,12 @@ class Page:
         if event is None:
             self.event_layer.set_content("")
             self.record.set_text("")
+            self.reached_by.set_text("")
             return
         record = record_of(self.shown.agent, event)
         self.event_layer.set_content(self.scene.selected(event))
         self.record.set_text(f"{record['id']}, a {record['kind']} at {record['center']}: options that begin here")
+        self.reached_by.set_text(f"Options that lead here: {record['reached_by']}.")
         self.table.columns = (
             [{"name": name, "label": name, "field": name} for name in record["rows"][0]] if record["rows"] else []
         )

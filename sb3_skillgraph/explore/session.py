@@ -104,14 +104,17 @@ def promised(plan: Plan) -> str:
 
 
 def record_of(agent: SkillGraphAgent, event: Event) -> dict[str, Any]:
-    """Return what is known of an event, and of the walks that begin there.
+    """Return what is known of an event, of the options that lead to it, and of those that begin there.
 
     :param agent: the agent
     :param event: one of its events
-    :return: ``id``, ``kind``, ``center``, ``rows``: of each walk its option, where it leads, runs that succeeded and failed,
-        what is expected of it, and where its runs landed
+    :return: ``id``, ``kind``, ``center``; ``reached_by``: in words, the options that lead to it and the events in which they
+        can begin; ``rows``: of each option that begins there its id, where it leads, runs that succeeded and failed, what is
+        expected of it, and where its runs landed
     """
     graph = agent.graph.nx
+    leading = [id for id, vertex in graph.nodes(data=True) if vertex.get("target") == event.id]
+    reached_by = "; ".join(f"{id} can begin in {', '.join(graph.predecessors(id)) or 'no event yet'}" for id in leading)
     expected = {link.target: link for link in event_links(agent) if link.source == event.id}
     rows = []
     for option in graph.successors(event.id):
@@ -131,4 +134,5 @@ def record_of(agent: SkillGraphAgent, event: Event) -> dict[str, Any]:
             }
         )
     kind = "salient event" if event.salient else "landmark"
-    return {"id": event.id, "kind": kind, "center": np.round(event.center, 3).tolist(), "rows": rows}
+    center = np.round(event.center, 3).tolist()
+    return {"id": event.id, "kind": kind, "center": center, "reached_by": reached_by, "rows": rows}
