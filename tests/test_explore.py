@@ -148,6 +148,17 @@ def test_an_environment_that_begins_where_it_likes(trained: SkillGraphAgent) -> 
         session.place("start", (0, 1), END)
 
 
+def test_an_environment_that_draws_where_it_begins() -> None:
+    class Drawn(gym.Wrapper):
+        def reset(self, *, seed: int | None = None, **_: Any) -> Any:
+            return self.env.reset(seed=seed, options={"start": np.random.default_rng(seed).uniform(-1.2, -0.8, 2)})
+
+    session = Session(new_agent(Drawn(gym.make(TOY))).learn(300), Drawn(gym.make(TOY)))
+    begun = session.start
+    session.place("goal", (0, 1), -END)
+    np.testing.assert_array_equal(next(session.go()).points[0], begun)
+
+
 def test_a_record_tells_of_runs_and_where_they_landed(trained: SkillGraphAgent) -> None:
     graph, edges = trained.graph, trained.graph.edges
     row = int((edges.successes + edges.failures).argmax())

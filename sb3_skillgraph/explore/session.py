@@ -38,6 +38,7 @@ class Session:
     def __init__(self, agent: SkillGraphAgent, env: gym.Env, seed: int = 0) -> None:
         self.agent = agent
         self.env = env
+        self.seed = seed
         observation, _ = env.reset(seed=seed)
         self.start = np.array(observation["achieved_goal"], dtype=np.float64)
         self.goal = np.array(observation["desired_goal"], dtype=np.float64)
@@ -58,7 +59,8 @@ class Session:
 
     def _begin(self, start: np.ndarray, goal: np.ndarray) -> dict[str, np.ndarray]:
         """Begin an episode; where the environment draws its goals itself it is told another one all the same."""
-        observation, _ = self.env.reset(options={"start": start, "goal": goal})
+        # With a seed, so that it begins in the same place again where it draws that, too.
+        observation, _ = self.env.reset(seed=self.seed, options={"start": start, "goal": goal})
         begun = np.asarray(observation["achieved_goal"], dtype=np.float64)
         if not self.agent.metric.reached(begun, start):
             raise ValueError(f"this environment begins where it likes: at {begun.round(2).tolist()}.")
