@@ -2,6 +2,7 @@
 
 import copy
 from collections.abc import Iterable, Sequence
+from inspect import signature
 from typing import Any, ClassVar, Literal, TypeVar
 
 import numpy as np
@@ -573,7 +574,8 @@ class SkillGraphAgent(OffPolicyAlgorithm):
         As SB3's ``load`` does, it seeds the generators of Python, NumPy and torch if the agent was made with a seed, and
         leaves them alone otherwise. ``learn(reset_num_timesteps=False)`` sets them to where they were at saving.
 
-        :param custom_objects: arguments to use in place of the saved ones, as ``kwargs`` are
+        :param custom_objects: arguments to use in place of the saved ones, as ``kwargs`` are; those of other algorithms are
+            left out, as SB3 does
         :param force_reset: begin ``learn`` at a fresh episode even if the environments' states were saved (SB3's default
             is to do so; here learning goes on exactly where it was)
         :raises ValueError: if the file is damaged, of another schema or no agent at all; if the environment does not fit;
@@ -582,7 +584,8 @@ class SkillGraphAgent(OffPolicyAlgorithm):
         """
         if print_system_info:
             get_system_info()
-        return persistence.load(cls, path, env, device, {**(custom_objects or {}), **kwargs}, force_reset)
+        known = {name: value for name, value in (custom_objects or {}).items() if name in signature(cls).parameters}
+        return persistence.load(cls, path, env, device, {**known, **kwargs}, force_reset)
 
     def copy(self: SelfSkillGraphAgent, env: GymEnv) -> SelfSkillGraphAgent:
         """Return a copy with an environment of its own, replay buffer included; what it learns leaves this one as it is."""

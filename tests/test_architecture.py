@@ -50,6 +50,7 @@ FLOORS: dict[str, float] = {
     "experiments": 14,
     "explore": 14.5,
     "cli": 15,
+    "zoo": 15,
     "__main__": 16,
     "__init__": 16,
 }
