@@ -116,8 +116,7 @@ def test_unknown_arguments_are_type_errors(trained_files: tuple[Path, Path], nam
         new_agent(**{name: None})
     with pytest.raises(TypeError, match=name):
         SkillGraphAgent.load(trained_files[0], **{name: None})
-    with pytest.raises(TypeError, match=name):
-        SkillGraphAgent.load(trained_files[0], custom_objects={name: None})
+    SkillGraphAgent.load(trained_files[0], custom_objects={name: None})  # there SB3 leaves out what is not in the file
 
 
 def test_learn_counts_steps_as_sb3_does() -> None:
