@@ -508,6 +508,17 @@ def test_a_file_beyond_the_limit(
         trained.load_replay_buffer(trained_files[1])
 
 
+def test_negative_records_are_refused(trained_files: tuple[Path, Path], tmp_path: Path) -> None:
+    tree = saving.load_tree(trained_files[0], "agent")
+    columns = {name: column for name, column in tree["graph"]["edges"].items() if column.dtype.kind == "f"}
+    assert {"successes", "failures", "crossing_steps", "landing_weight"} <= columns.keys()
+    for name, column in columns.items():
+        wrong = {**tree["graph"]["edges"], name: column - 1e6}
+        saving.save_tree(tmp_path / "wrong", "agent", {**tree, "graph": {**tree["graph"], "edges": wrong}})
+        with pytest.raises(ValueError, match=f"graph/edges/{name}"):
+            SkillGraphAgent.load(tmp_path / "wrong")
+
+
 def test_files_that_promise_more_than_they_hold(trained_files: tuple[Path, Path]) -> None:
     for way, value in [
         (("arguments", "buffer_size"), 10**15),
