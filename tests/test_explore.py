@@ -93,6 +93,7 @@ def test_two_of_several_dimensions_are_shown() -> None:
     agent = new_agent(gym.make("SkillGraph/PointKeyDoor-v0")).learn(300)
     scene = Scene(agent, None, (1, 2))
     assert scene.frame.dims == (1, 2)
+    assert scene.frame.size == Scene(agent, geometry_of(gym.make("SkillGraph/PointKeyDoor-v0"))).frame.size
     assert scene.graph().count("<circle") == len(agent.events)
 
 

@@ -44,11 +44,15 @@ class Frame(NamedTuple):
         """
         if geometry is not None and dims == (0, 1):
             left, right, bottom, top = geometry.extent
-            return cls(dims, np.array([left, bottom]), np.array([right, top]))
-        centers = agent.graph.centers if len(agent.events) else np.zeros((1, agent.graph.goal_dim))
-        margin = 2.0 * max(disc_radius(agent), 1e-3)
-        shown = centers[:, dims]
-        return cls(dims, shown.min(axis=0) - margin, shown.max(axis=0) + margin)
+            low, high = np.array([left, bottom]), np.array([right, top])
+        else:
+            centers = agent.graph.centers if len(agent.events) else np.zeros((1, agent.graph.goal_dim))
+            shown, margin = centers[:, dims], 2.0 * max(disc_radius(agent), 1e-3)
+            low, high = shown.min(axis=0) - margin, shown.max(axis=0) + margin
+        if agent.graph.goal_dim > 2:  # a square, whichever dimensions are chosen
+            middle, half = (low + high) / 2.0, (high - low).max() / 2.0
+            low, high = middle - half, middle + half
+        return cls(dims, low, high)
 
     @property
     def scale(self) -> float:
