@@ -24,7 +24,7 @@ from sb3_skillgraph.goal_env import refuse_changed_goals
 from sb3_skillgraph.options.learner import OptionDDPG, OptionLearner, OptionTD3
 from sb3_skillgraph.rules import PaperRules
 from sb3_skillgraph.saving import MissingCallable, PathOrFile, check_encoding, known_class, load_tree
-from sb3_skillgraph.schema import check_header, check_learned, check_parameters
+from sb3_skillgraph.schema import check_header, check_learned, check_parameters, finite
 
 for _option_class in (OptionDDPG, OptionTD3):
     known_class(_option_class)
@@ -128,6 +128,7 @@ def _told(who: str, get_state: Callable[[], Any]) -> Any:
     try:
         state = get_state()
         check_encoding(state, "its state")
+        finite(state, "its state")
         return state
     except Exception as error:  # whatever the user's own code, or a worker that has died, raises
         warnings.warn(
@@ -152,7 +153,9 @@ def _env_states(env: VecEnv, last_obs: Any) -> dict[str, Any] | None:
         return None
     snapshot = {"states": env.env_method("get_state"), "last_obs": last_obs}
     if all(env.env_is_wrapped(Monitor)):
-        snapshot["monitor_rewards"] = [list(map(float, rewards)) for rewards in env.get_attr("rewards")]
+        rewards = [list(map(float, own)) for own in env.get_attr("rewards")]
+        if all(np.isfinite(own).all() for own in rewards):
+            snapshot["monitor_rewards"] = rewards
     return snapshot
 
 

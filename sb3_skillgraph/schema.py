@@ -92,7 +92,7 @@ def check_learned(agent: Any, tree: dict[str, Any], env: VecEnv | None) -> None:
     """
     check_parameters(agent.parts.walker.learner, tree["parameters"])
     _check_noise(agent)
-    _finite({name: value for name, value in tree.items() if name not in ("arguments", "spaces", "parameters")}, "the file")
+    finite({name: value for name, value in tree.items() if name not in ("arguments", "spaces", "parameters")}, "the file")
     if agent.rules is not None:
         return
     n_events = len(tree["graph"]["events"]) if isinstance(tree.get("graph"), dict) else 0
@@ -122,7 +122,7 @@ def check_parameters(learner: OffPolicyAlgorithm, given: Any) -> None:
         holder = recursive_getattr(learner, name)  # as SB3 finds them: "actor.optimizer"
         check = optimizer_state(holder) if isinstance(holder, th.optim.Optimizer) else state_dict(value)
         check(given[name], f"parameters/{name}")
-    _finite(given.get("variables", {}), "parameters/variables")
+    finite(given.get("variables", {}), "parameters/variables")
 
 
 def _check_noise(agent: Any) -> None:
@@ -136,18 +136,23 @@ def _check_noise(agent: Any) -> None:
         refuse("arguments/action_noise", f"noise for {n_actions} actions", drawn)
 
 
-def _finite(tree: Any, where: str) -> None:
-    """Check that no number of a tree is infinite or none."""
+def finite(tree: Any, where: str) -> None:
+    """Check that no number of a tree is infinite or none.
+
+    :param tree: plain data
+    :param where: it stands
+    :raises ValueError: naming the place
+    """
     if isinstance(tree, float) and not np.isfinite(tree):
         refuse(where, "finite", tree)
     if isinstance(tree, np.ndarray) and tree.dtype.kind == "f" and not np.isfinite(tree).all():
         refuse(where, "finite", tree)
     if isinstance(tree, dict):
         for name, value in tree.items():
-            _finite(value, f"{where}/{name}")
+            finite(value, f"{where}/{name}")
     if isinstance(tree, list | tuple):
         for i, value in enumerate(tree):
-            _finite(value, f"{where}/{i}")
+            finite(value, f"{where}/{i}")
 
 
 # -- the graph --------------------------------------------------------------------------------------------------------
@@ -288,11 +293,19 @@ def _at_most(n: int, check: Check) -> Check:
     return check_length
 
 
+def _state_of(env: VecEnv) -> Any:
+    """Return the state of the first environment; None if it cannot tell it, as before its first reset."""
+    try:
+        return env.env_method("get_state", indices=0)[0] if env.has_attr("get_state") else None
+    except Exception:  # whatever the user's own code raises
+        return None
+
+
 def _environments(n_envs: int, agent: Any, env: VecEnv | None) -> Check:
     """Check the states of environments: of the one that is given, if it can tell its own."""
     shown = {name: _shown(n_envs, box) for name, box in agent.observation_space.spaces.items()}
-    if env is not None and env.num_envs == n_envs and env.has_attr("get_state"):
-        own = env.env_method("get_state", indices=0)[0]
+    own = _state_of(env) if env is not None and env.num_envs == n_envs else None
+    if env is not None and own is not None:
         shapes = entries(**{name: _like_any(value) for name, value in own.items()}) if isinstance(own, dict) else anything
 
         def state(value: Any, where: str) -> None:

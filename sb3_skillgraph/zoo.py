@@ -91,8 +91,8 @@ def main() -> None:
         sys.exit(f"{__doc__}\nThe scripts are {', '.join(SCRIPTS)}.")
     register()
     script = sys.argv.pop(1)
-    if script == "train" and not {"-conf", "--conf-file"} & set(sys.argv):
-        sys.argv += ["--conf-file", "sb3_skillgraph.zoo"]
+    if script == "train":
+        sys.argv[1:1] = ["--conf-file", "sb3_skillgraph.zoo"]  # in front: of two the last counts
     SCRIPTS[script]()
 
 

@@ -676,6 +676,7 @@ STATES = [
     ({"seen": {1, 2}}, "seen cannot be saved: a set"),
     ({"when": np.datetime64("2020-01-01")}, "when cannot be saved"),
     ({"rows": np.zeros(2, [("x", "f4")])}, "rows cannot be saved: an array of"),
+    ({"best": np.inf}, "best must be finite"),
     ({"named": Named(1)}, "named cannot be saved: a Named"),
     ({"masked": np.ma.masked_array([1.0], [True])}, "masked cannot be saved: a MaskedArray"),
 ]

@@ -124,7 +124,10 @@ def test_the_papers_rules_are_shown_too() -> None:
     assert session.next_best() is None
     assert promised(session.plan()).startswith("probability")
     for event in agent.events:
-        assert record_of(agent, event)["id"] == event.id
+        record = record_of(agent, event)
+        assert record["id"] == event.id and all(row["succeeded"] == "-" for row in record["rows"])
+    option = agent.graph.nx
+    assert any(option.out_degree(id) for id, vertex in option.nodes(data=True) if vertex["kind"] != "event")
     Scene(agent, geometry_of(session.env)).graph()
 
 
@@ -208,6 +211,32 @@ def test_a_video_shows_the_environment_and_the_plan(trained: SkillGraphAgent, tm
     assert frames.shape[1:] == (480, 960, 3)
     assert (frames[0][:, :480] == 128).all() and frames[0][:, 480:].std() > 30
     assert [path.name for path in (tmp_path / "new").iterdir()] == ["plan.gif"]
+
+
+def test_goals_of_one_dimension(tmp_path: Path) -> None:
+    class Line(gym.ObservationWrapper):
+        success_radius = 0.3
+        render_mode = "rgb_array"
+
+        def __init__(self) -> None:
+            super().__init__(gym.make(TOY, max_steps=50))
+            box = gym.spaces.Box(-2.0, 2.0, (1,), np.float32)
+            self.observation_space = gym.spaces.Dict(dict.fromkeys(("observation", "achieved_goal", "desired_goal"), box))
+
+        def observation(self, observation: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+            return {key: value[:1] for key, value in observation.items()}
+
+        def reset(self, *, seed: int | None = None) -> Any:  # it takes no options
+            observation, info = self.env.reset(seed=seed)
+            return self.observation(observation), info
+
+        def render(self) -> Any:
+            return np.zeros((10, 10, 3), dtype=np.uint8)
+
+    env = Line()
+    agent = new_agent(env, option_view="relative", event_radius=0.3).learn(400)
+    export(agent, tmp_path / "graph.html")
+    assert "happened" in record(agent, env, tmp_path / "line.gif", seed=1)
 
 
 @pytest.mark.parametrize(

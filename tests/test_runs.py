@@ -95,6 +95,55 @@ def test_a_run_that_is_done_but_for_its_mark_is_finished(
     assert not checkpoints(stopped)
 
 
+def test_a_mark_without_its_agent_is_none(stopped: Path) -> None:
+    (stopped / "agent.zip").unlink()
+    (stopped / "done.json").write_text("{}")  # of a run before, whose agent was removed
+    (stopped / "graph_9.json").write_text("{}")
+    assert cli.main([*COMMAND, str(stopped)]) == 0
+    assert (stopped / "agent.zip").exists()
+
+
+def test_what_is_begun_anew_keeps_nothing_of_what_was(tmp_path: Path) -> None:
+    (tmp_path / "graph_999.json").write_text("{}")
+    (tmp_path / "done.json").write_text("{}")
+    assert cli.main([*COMMAND, str(tmp_path)]) == 0
+    assert "graph_999.json" not in [path.name for path in tmp_path.iterdir()]
+
+
+def test_a_finished_run_that_cannot_be_extended_stays_finished(tmp_path: Path, capsys: Capture) -> None:
+    assert cli.main([*COMMAND, str(tmp_path)]) == 0
+    agent = (tmp_path / "agent.zip").read_bytes()
+    (tmp_path / "agent.zip").write_bytes(agent[:-20])
+    longer = [*COMMAND[:3], "500", *COMMAND[4:], str(tmp_path)]
+    for _ in range(2):
+        with pytest.warns(UserWarning, match="left out"):
+            assert cli.main(longer) == 2
+    assert (tmp_path / "done.json").exists()
+    (tmp_path / "agent.zip").write_bytes(agent)
+    assert cli.main(longer) == 0
+    assert "going on after 400 steps" in capsys.readouterr().out
+
+
+def test_steps_by_episodes_are_no_more_than_asked_for_and_an_episode(tmp_path: Path) -> None:
+    env_kwargs, arguments = {"max_steps": 30}, {"train_freq": (1, "episode"), "learning_starts": 50}
+    agent = training.train(TOY, env_kwargs, arguments, 300, 0, tmp_path)
+    assert 300 <= agent.num_timesteps < 330
+
+
+def test_what_is_stored_by_name_only_is_given_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(training, "CHECKPOINT_EVERY", 100)
+    arguments = {"learning_rate": schedule, "learning_starts": 50}
+    with monkeypatch.context() as patch:
+        patch.setattr(training.Clock, "_on_step", lambda clock: clock.num_timesteps < 250 or killed())
+        with pytest.raises(Killed):
+            training.train(TOY, {}, arguments, 300, 0, tmp_path)
+    assert training.train(TOY, {}, arguments, 300, 0, tmp_path).num_timesteps == 300
+
+
+def schedule(progress: float) -> float:
+    return 1e-3 * progress
+
+
 def test_two_checkpoints_are_kept(tmp_path: Path) -> None:
     (tmp_path / "checkpoint_5").mkdir()
     for n in (10, 20, 30):

@@ -51,7 +51,7 @@ def test_the_zoos_hyperparameters_are_those_of_the_command_line() -> None:
 def test_schedules_and_numbers_of_another_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     entry = {"n_timesteps": 200, "policy": "MultiInputPolicy", "learning_rate": "lin_1e-3", "option_class": "OptionTD3"}
     (tmp_path / "own.yml").write_text(yaml.safe_dump({TOY: {**entry, "train_freq": [1, "episode"]}}))
-    run(monkeypatch, "train", "--conf-file", tmp_path / "own.yml", "-f", tmp_path, "--eval-freq", -1)
+    run(monkeypatch, "train", f"--conf-file={tmp_path / 'own.yml'}", "-f", tmp_path, "--eval-freq", -1)
     agent = SkillGraphAgent.load(tmp_path / FOLDER / "SkillGraph-ToyMaze-v0.zip", learning_rate=1e-3)
     assert type(agent.parts.walker.learner).__name__ == "OptionTD3" and agent.num_timesteps >= 200
 

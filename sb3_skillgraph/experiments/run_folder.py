@@ -148,14 +148,15 @@ def save_agent(agent: SkillGraphAgent, folder: Path) -> None:
     agent.save_replay_buffer(folder / EXPERIENCE)
 
 
-def load_agent(folder: Path, env: GymEnv, device: th.device | str = "auto") -> SkillGraphAgent:
+def load_agent(folder: Path, env: GymEnv, device: th.device | str = "auto", **given: Any) -> SkillGraphAgent:
     """Load an agent and its experience.
 
     :param folder: of a checkpoint
     :param env: the environment it is to go on in
     :param device: torch device
+    :param given: arguments of which the file holds the names only
     """
-    agent = SkillGraphAgent.load(folder / AGENT, env=env, device=device)
+    agent = SkillGraphAgent.load(folder / AGENT, env=env, device=device, **given)
     agent.load_replay_buffer(folder / EXPERIENCE)
     return agent
 

@@ -37,7 +37,7 @@ from sb3_skillgraph.experiments.run_folder import (
     stops,
     take_checkpoint,
 )
-from sb3_skillgraph.files import write_text
+from sb3_skillgraph.files import replaced, write_text
 from sb3_skillgraph.plotting import snapshot
 from sb3_skillgraph.rules import PaperRules
 
@@ -86,9 +86,13 @@ def train(
         with _claimed(out):
             with for_people():
                 _check_folder(out, config)
-                begin, loaded = load_newest(out, lambda folder: load_agent(folder, env, device))
+                begin, loaded = load_newest(out, lambda folder: load_agent(folder, env, device, **_named(arguments)))
                 rows = read_progress(checkpoints(out)[begin]) if loaded is not None else []
-            if loaded is not None:
+            (out / DONE).unlink(missing_ok=True)
+            if loaded is None:  # what is seen of another graph, of a run of which nothing came
+                for path in out.glob("graph_*.json"):
+                    path.unlink()
+            else:
                 fresh = "" if env.has_attr("get_state") else f", at a fresh episode: {env_id} cannot tell its state"
                 print(f"going on after {begin} steps{fresh}")
                 agent = loaded
@@ -119,7 +123,7 @@ def _check_folder(out: Path, config: dict[str, Any]) -> None:
     if not checkpoints(out) and not (out / AGENT).exists():
         return  # nothing came of it
     done = _check_config(out, config)
-    if not (out / DONE).exists():
+    if not (out / DONE).exists() or not (out / AGENT).exists():
         return
     _discard_checkpoints(out)
     if config["steps"] <= done:
@@ -127,13 +131,18 @@ def _check_folder(out: Path, config: dict[str, Any]) -> None:
             f"{out} holds an agent already, of {done} steps: give more --steps to train it further, another folder with "
             "--out, or remove it."
         )
-    take_checkpoint(out, done, lambda folder: _copy_run(out, folder))
-    (out / DONE).unlink()
+    take_checkpoint(out, done, lambda folder: _copy(out, folder, AGENT, EXPERIENCE, PROGRESS))
 
 
-def _copy_run(out: Path, folder: Path) -> None:
-    for name in (AGENT, EXPERIENCE, PROGRESS):
-        shutil.copy2(out / name, folder)
+def _copy(out: Path, folder: Path, *names: str) -> None:
+    for name in names:
+        with (out / name).open("rb") as source, replaced(folder / name) as file:
+            shutil.copyfileobj(source, file)
+
+
+def _named(arguments: dict[str, Any]) -> dict[str, Any]:
+    """Return the arguments of which a file holds the names only."""
+    return {name: value for name, value in arguments.items() if callable(value) or hasattr(value, "propose")}
 
 
 def _learn(agent: SkillGraphAgent, begin: int, steps: int, out: Path, elapsed: float) -> None:
@@ -142,8 +151,11 @@ def _learn(agent: SkillGraphAgent, begin: int, steps: int, out: Path, elapsed: f
     try:
         with _stopped_politely() as is_asked_to_stop:
             for target in stops(begin, steps, min(STOP_EVERY, CHECKPOINT_EVERY)):
-                # By what was asked for: a call of several environments may overshoot, and the next makes up for it.
-                agent.learn(target - begin, callback=callbacks, reset_num_timesteps=False)
+                # By what was asked for: a call of several environments may overshoot, and the next makes up for it; one that
+                # ends with an episode overshoots by more than the agent knows of.
+                by_episodes = agent.train_freq.unit.value == "episode"  # type: ignore[union-attr]
+                n_steps = max(target - agent.num_timesteps, 0) if by_episodes else target - begin
+                agent.learn(n_steps, callback=callbacks, reset_num_timesteps=False)
                 if target * N_LOOKS // steps > begin * N_LOOKS // steps:
                     write_text(out / f"graph_{target}.json", json.dumps({"steps": target, **snapshot(agent)}) + "\n")
                     if bar is None:
@@ -175,7 +187,7 @@ def _save(agent: SkillGraphAgent, out: Path, folder: Path) -> None:
     """Save what a run goes on from; its log, too, which is begun anew then."""
     save_agent(agent, folder)
     if (out / PROGRESS).exists():
-        shutil.copy2(out / PROGRESS, folder)
+        _copy(out, folder, PROGRESS)
 
 
 class Clock(BaseCallback):
@@ -243,7 +255,7 @@ def _logger(out: Path, rows: list[dict[str, Any]], verbose: bool, tensorboard: b
 def _check_config(out: Path, config: dict[str, Any]) -> int:
     """Refuse a run with other settings than before, but for more steps; return how many there were to be."""
     before = run_config(out)
-    del before["versions"]
+    before.pop("versions", None)
     asked = json.loads(_as_json(config))
     done, more = before.pop("steps"), asked.pop("steps")
     if before != asked or more < done:

@@ -42,7 +42,7 @@ def _node_link(agent: SkillGraphAgent) -> str:
 
 
 def _page(agent: SkillGraphAgent, geometry: MazeGeometry | None, title: str) -> str:
-    scene = Scene(agent, geometry)
+    scene = Scene(agent, geometry, (0, min(1, agent.graph.goal_dim - 1)))
     summary = agent.graph_summary()
     counts = f"{summary['events']} events, {summary['salient_events']} of them salient; {summary['edges']} edges"
     events: dict[str, Any] = {event.id: {**record_of(agent, event), "drawn": scene.selected(event)} for event in agent.events}

@@ -212,7 +212,12 @@ class Page:
     def _tick(self) -> None:
         if self.run is None:
             return
-        done = list(itertools.islice(self.run, STEPS_A_FRAME if self.renders else STEPS_A_TICK))
+        try:
+            done = list(itertools.islice(self.run, STEPS_A_FRAME if self.renders else STEPS_A_TICK))
+        except Exception as error:  # whatever the environment raises
+            self.happened.set_text(f"the environment failed: {error}")
+            self._stop()
+            return
         if not done:  # there from the beginning
             self.happened.set_text("the goal is where the start is")
             self._stop()

@@ -60,7 +60,10 @@ class Session:
     def _begin(self, start: np.ndarray, goal: np.ndarray) -> dict[str, np.ndarray]:
         """Begin an episode; where the environment draws its goals itself it is told another one all the same."""
         # With a seed, so that it begins in the same place again where it draws that, too.
-        observation, _ = self.env.reset(seed=self.seed, options={"start": start, "goal": goal})
+        try:
+            observation, _ = self.env.reset(seed=self.seed, options={"start": start, "goal": goal})
+        except TypeError:  # it takes no options
+            observation, _ = self.env.reset(seed=self.seed)
         begun = np.asarray(observation["achieved_goal"], dtype=np.float64)
         if not self.agent.metric.reached(begun, start):
             raise ValueError(f"this environment begins where it likes: at {begun.round(2).tolist()}.")
@@ -76,7 +79,7 @@ class Session:
         """Return the best plan that begins otherwise; None if there is none, or the paper's rules make the plans."""
         if self.agent.rules is not None:
             return None
-        return next_best(self.agent.parts.runner, self.start, self.goal.astype(np.float32))
+        return next_best(self.agent.parts.runner, self._observation["achieved_goal"], self._observation["desired_goal"])
 
     def go(self) -> Iterator[Progress]:
         """Follow the plan in the environment, a step at a time."""
@@ -123,13 +126,13 @@ def record_of(agent: SkillGraphAgent, event: Event) -> dict[str, Any]:
         target = graph.nodes[option].get("target")
         link = expected.get(target)
         record = graph.edges[event.id, option]
-        landed = sorted(((graph.edges[option, end]["rate"], end) for end in graph.successors(option)), reverse=True)[:3]
+        landed = sorted(((_rate(graph.edges[option, end]), end) for end in graph.successors(option)), reverse=True)[:3]
         rows.append(
             {
                 "option": option,
                 "to": target,
-                "succeeded": round(record.get("successes", 0.0), 1),
-                "failed": round(record.get("failures", 0.0), 1),
+                "succeeded": round(record["successes"], 1) if "successes" in record else "-",
+                "failed": round(record["failures"], 1) if "failures" in record else "-",
                 "expected": "-" if link is None else f"{link.success_probability:.0%}",
                 "steps": "-" if link is None else round(link.steps),
                 "lands in": ", ".join(f"{end} {rate:.0%}" for rate, end in landed),
@@ -138,3 +141,8 @@ def record_of(agent: SkillGraphAgent, event: Event) -> dict[str, Any]:
     kind = "salient event" if event.salient else "landmark"
     center = np.round(event.center, 3).tolist()
     return {"id": event.id, "kind": kind, "center": center, "reached_by": reached_by, "rows": rows}
+
+
+def _rate(landing: dict[str, Any]) -> float:
+    """Return the share of an option's runs that landed somewhere; by the paper's rules, of those that succeeded."""
+    return float(landing.get("rate", landing.get("success_rate", 0.0)))

@@ -16,7 +16,7 @@ from sb3_skillgraph.explore.session import Progress, Session, promised
 from sb3_skillgraph.files import PARTIAL
 from sb3_skillgraph.plan import Plan
 from sb3_skillgraph.plotting import Trajectory
-from sb3_skillgraph.plotting.figures import draw_floor
+from sb3_skillgraph.plotting.figures import disc_radius, draw_floor, project
 from sb3_skillgraph.plotting.plan import draw_planned
 
 #: Pictures a second; sides of both halves, in pixels; how long the last picture stays, in pictures.
@@ -100,10 +100,10 @@ class _Canvas:
         self.canvas = FigureCanvasAgg(figure)
         axes, agent, geometry = figure.add_subplot(), session.agent, geometry_of(session.env)
         centers = np.vstack([agent.graph.centers, session.start, session.goal])
-        draw_floor(axes, geometry, centers, 2.0 * float(agent.metric.reach(agent.graph.goal_dim)[:2].max()))
-        axes.plot(*agent.graph.centers[:, :2].T, "o", color="#999999", markersize=2)
+        draw_floor(axes, geometry, centers, 2.0 * disc_radius(agent))
+        axes.plot(*project(agent.graph.centers).T, "o", color="#999999", markersize=2)
         draw_planned(axes, agent, geometry, Trajectory(session.start[None], [], session.goal, False), plan)
-        axes.plot(*session.goal[:2], "*", color="#d62728", markersize=12)
+        axes.plot(*project(session.goal[None]).T, "*", color="#d62728", markersize=12)
         self.title = axes.set_title("", fontsize=9)
         (self.trace,) = axes.plot([], [], color="#4477aa", linewidth=2.5, zorder=9)
         (self.agent,) = axes.plot([], [], "o", color="#ffffff", markeredgecolor="#111111", markeredgewidth=2, zorder=10)
@@ -114,7 +114,7 @@ class _Canvas:
         if progress.over:
             happened = f"goal {'reached' if progress.success else 'missed'} after {len(progress.options)} steps"
         self.title.set_text(f"Promised: {promised(self.plan)}\nHappened: {happened}")
-        self.trace.set_data(*progress.points[:, :2].T)
-        self.agent.set_data(*progress.points[-1:, :2].T)
+        self.trace.set_data(*project(progress.points).T)
+        self.agent.set_data(*project(progress.points[-1:]).T)
         self.canvas.draw()
         return np.asarray(self.canvas.buffer_rgba())[:, :, :3]
