@@ -13,8 +13,9 @@ import networkx as nx
 import numpy as np
 import pytest
 from conftest import TOY, new_agent
+from test_paper import small
 
-from sb3_skillgraph import PAPER, SkillGraphAgent, cli
+from sb3_skillgraph import SkillGraphAgent, cli
 from sb3_skillgraph.envs import geometry_of
 from sb3_skillgraph.explore.export import export
 from sb3_skillgraph.explore.scene import CLICK_RADIUS, Scene
@@ -119,7 +120,7 @@ def test_the_next_best_plan_begins_otherwise_and_costs_more(session: Session, tr
 
 
 def test_the_papers_rules_are_shown_too() -> None:
-    agent = SkillGraphAgent("MultiInputPolicy", gym.make(TOY, max_steps=60), seed=0, **PAPER).learn(1_500)
+    agent = small().learn(4_000, log_interval=None)
     session = Session(agent, gym.make(TOY))
     assert session.next_best() is None
     assert promised(session.plan()).startswith("probability")

@@ -125,14 +125,15 @@ def test_a_finished_run_that_cannot_be_extended_stays_finished(tmp_path: Path, c
 
 
 def test_steps_by_episodes_are_no_more_than_asked_for_and_an_episode(tmp_path: Path) -> None:
-    env_kwargs, arguments = {"max_steps": 30}, {"train_freq": (1, "episode"), "learning_starts": 50}
+    env_kwargs = {"max_steps": 30}
+    arguments = {"policy": "MultiInputPolicy", "train_freq": (1, "episode"), "learning_starts": 50}
     agent = training.train(TOY, env_kwargs, arguments, 300, 0, tmp_path)
     assert 300 <= agent.num_timesteps < 330
 
 
 def test_what_is_stored_by_name_only_is_given_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(training, "CHECKPOINT_EVERY", 100)
-    arguments = {"learning_rate": schedule, "learning_starts": 50}
+    arguments = {"policy": "MultiInputPolicy", "learning_rate": schedule, "learning_starts": 50}
     with monkeypatch.context() as patch:
         patch.setattr(training.Clock, "_on_step", lambda clock: clock.num_timesteps < 250 or killed())
         with pytest.raises(Killed):
