@@ -219,9 +219,7 @@ def copy(agent: Any, env: Any) -> Any:
     agent_file, replay_file = io.BytesIO(), io.BytesIO()
     agent.save(agent_file)
     agent.save_replay_buffer(replay_file)
-    # What is stored by name only is given again.
-    named = {name: value for name, value in agent._arguments.items() if callable(value) or hasattr(value, "propose")}
-    twin = load(type(agent), agent_file, env, agent.device, named, force_reset=False)
+    twin = load(type(agent), agent_file, env, agent.device, kept_by_name(agent._arguments), force_reset=False)
     twin.load_replay_buffer(replay_file)
     return twin
 
@@ -359,6 +357,14 @@ def restore_experience(parts: Any, state: dict[str, Any]) -> None:
     except ValueError:
         parts.set_experience(before)
         raise
+
+
+def kept_by_name(arguments: dict[str, Any]) -> dict[str, Any]:
+    """Return the arguments that are stored by name only, to be given again.
+
+    :param arguments: of the constructor
+    """
+    return {name: value for name, value in arguments.items() if callable(value) or hasattr(value, "propose")}
 
 
 def require_callables(arguments: Any, name: str = "") -> None:

@@ -125,7 +125,7 @@ def test_the_papers_rules_are_shown_too() -> None:
     assert session.next_best() is None
     assert promised(session.plan()).startswith("probability")
     for event in agent.events:
-        record = record_of(agent, event)
+        record = record_of(agent, event, event_links(agent))
         assert record["id"] == event.id and all(row["succeeded"] == "-" for row in record["rows"])
     option = agent.graph.nx
     assert any(option.out_degree(id) for id, vertex in option.nodes(data=True) if vertex["kind"] != "event")
@@ -168,12 +168,12 @@ def test_a_record_tells_of_runs_and_where_they_landed(trained: SkillGraphAgent) 
     graph, edges = trained.graph, trained.graph.edges
     row = int((edges.successes + edges.failures).argmax())
     source, target = (trained.events[int(end[row])] for end in (edges.source, edges.target))
-    known = record_of(trained, source)
+    known = record_of(trained, source, event_links(trained))
     option = next(one for one in known["rows"] if one["to"] == target.id)
     assert option["option"] == graph.walk_ids[int(edges.target[row])]
     assert option["succeeded"] == round(float(edges.successes[row]), 1)
     assert re.fullmatch(r"(e\d+ \d+%(, )?)+", option["lands in"])
-    reached_by = record_of(trained, target)["reached_by"]
+    reached_by = record_of(trained, target, event_links(trained))["reached_by"]
     assert reached_by.startswith(f"{option['option']} can begin in ") and source.id in re.findall(r"e\d+", reached_by)
 
 

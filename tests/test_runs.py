@@ -87,7 +87,7 @@ def test_a_run_that_is_done_but_for_its_mark_is_finished(
     stopped: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as patch:
-        patch.setattr(training, "_discard_checkpoints", killed)
+        patch.setattr(training, "discard_all", killed)
         with pytest.raises(Killed):
             cli.main([*COMMAND, str(stopped)])
     assert (stopped / "done.json").exists() and checkpoints(stopped)

@@ -138,6 +138,15 @@ def discard(checkpoint: Path) -> None:
     shutil.rmtree(partial)
 
 
+def discard_all(folder: Path) -> None:
+    """Remove a run's checkpoints.
+
+    :param folder: of the run
+    """
+    for path in checkpoints(folder).values():
+        discard(path)
+
+
 def save_agent(agent: SkillGraphAgent, folder: Path) -> None:
     """Save an agent and its experience.
 

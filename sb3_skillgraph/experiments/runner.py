@@ -31,6 +31,7 @@ from sb3_skillgraph.experiments.run_folder import (
     checkpoints,
     claimed,
     discard,
+    discard_all,
     load_newest,
     read_json,
     read_progress,
@@ -233,8 +234,7 @@ class _Run:
     def _resume(self, learner: Learner) -> int:
         """Load the newest checkpoint and drop what was written after it; return the steps done."""
         if not learner.resumable:
-            for path in checkpoints(self.folder).values():
-                discard(path)
+            discard_all(self.folder)
         steps, _ = load_newest(self.folder, learner.load)
         self.rows = [row for row in read_progress(self.folder) if row[STEPS] <= steps]
         if not self.rows:

@@ -28,7 +28,7 @@ from sb3_skillgraph.experiments.run_folder import (
     STEPS,
     checkpoints,
     claimed,
-    discard,
+    discard_all,
     load_agent,
     load_newest,
     read_progress,
@@ -38,6 +38,7 @@ from sb3_skillgraph.experiments.run_folder import (
     take_checkpoint,
 )
 from sb3_skillgraph.files import replaced, write_text
+from sb3_skillgraph.persistence import kept_by_name
 from sb3_skillgraph.plotting import snapshot
 from sb3_skillgraph.rules import PaperRules
 
@@ -86,7 +87,7 @@ def train(
         with _claimed(out):
             with for_people():
                 _check_folder(out, config)
-                begin, loaded = load_newest(out, lambda folder: load_agent(folder, env, device, **_named(arguments)))
+                begin, loaded = load_newest(out, lambda folder: load_agent(folder, env, device, **kept_by_name(arguments)))
                 rows = read_progress(checkpoints(out)[begin]) if loaded is not None else []
             (out / DONE).unlink(missing_ok=True)
             if loaded is None:  # what is seen of another graph, of a run of which nothing came
@@ -125,7 +126,7 @@ def _check_folder(out: Path, config: dict[str, Any]) -> None:
     done = _check_config(out, config)
     if not (out / DONE).exists() or not (out / AGENT).exists():
         return
-    _discard_checkpoints(out)
+    discard_all(out)
     if config["steps"] <= done:
         raise UserError(
             f"{out} holds an agent already, of {done} steps: give more --steps to train it further, another folder with "
@@ -138,11 +139,6 @@ def _copy(out: Path, folder: Path, *names: str) -> None:
     for name in names:
         with (out / name).open("rb") as source, replaced(folder / name) as file:
             shutil.copyfileobj(source, file)
-
-
-def _named(arguments: dict[str, Any]) -> dict[str, Any]:
-    """Return the arguments of which a file holds the names only."""
-    return {name: value for name, value in arguments.items() if callable(value) or hasattr(value, "propose")}
 
 
 def _learn(agent: SkillGraphAgent, begin: int, steps: int, out: Path, elapsed: float) -> None:
@@ -175,12 +171,7 @@ def _learn(agent: SkillGraphAgent, begin: int, steps: int, out: Path, elapsed: f
         if agent.num_timesteps < steps:
             print(f"the same command goes on after {max(checkpoints(out), default=0)} steps")
     write_json(out / DONE, {"steps": agent.num_timesteps})
-    _discard_checkpoints(out)
-
-
-def _discard_checkpoints(out: Path) -> None:
-    for path in checkpoints(out).values():
-        discard(path)
+    discard_all(out)
 
 
 def _save(agent: SkillGraphAgent, out: Path, folder: Path) -> None:

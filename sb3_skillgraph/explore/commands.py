@@ -11,7 +11,7 @@ import gymnasium as gym
 
 from sb3_skillgraph.envs import geometry_of
 from sb3_skillgraph.experiments.console import UserError, for_people, positive
-from sb3_skillgraph.experiments.opening import add_agent, add_command, check_env_id, find_run, load_agent, make_env
+from sb3_skillgraph.experiments.opening import add_agent, add_command, find_run, load_agent, make_env
 from sb3_skillgraph.experiments.run_folder import read_json
 from sb3_skillgraph.explore.export import export
 from sb3_skillgraph.explore.video import record
@@ -80,7 +80,6 @@ def rendered(env_id: str, env_kwargs: dict[str, Any]) -> gym.Env:
     """
     if sys.platform == "linux" and not os.environ.get("DISPLAY"):
         os.environ.setdefault("MUJOCO_GL", "egl")  # MuJoCo's own choice is a window
-    check_env_id(env_id)
     try:
         return make_env(env_id, {**env_kwargs, "render_mode": "rgb_array"})
     except UserError:  # it knows of no such argument
@@ -92,7 +91,7 @@ def _explore(args: argparse.Namespace) -> int:
         from sb3_skillgraph.explore import page
     except ImportError as error:
         raise UserError(f"explore needs the package {error.name}: pip install 'sb3_skillgraph[explore]'.") from error
-    _check_port(args.port)
+    _check_port(page.HOST, args.port)
     path, env_id, env_kwargs = find_run(args)
     agent = load_agent(path, rendered(env_id, env_kwargs))
     with for_people():
@@ -103,11 +102,11 @@ def _explore(args: argparse.Namespace) -> int:
     return 0
 
 
-def _check_port(port: int) -> None:
+def _check_port(host: str, port: int) -> None:
     with socket.socket() as tried:
         tried.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
-            tried.bind(("127.0.0.1", port))
+            tried.bind((host, port))
         except (OSError, OverflowError) as error:
             raise UserError(f"port {port} cannot be had ({error}): choose another one with --port.") from error
 

@@ -45,7 +45,9 @@ def _page(agent: SkillGraphAgent, geometry: MazeGeometry | None, title: str) -> 
     scene = Scene(agent, geometry, (0, min(1, agent.graph.goal_dim - 1)))
     summary = agent.graph_summary()
     counts = f"{summary['events']} events, {summary['salient_events']} of them salient; {summary['edges']} edges"
-    events: dict[str, Any] = {event.id: {**record_of(agent, event), "drawn": scene.selected(event)} for event in agent.events}
+    events: dict[str, Any] = {
+        event.id: {**record_of(agent, event, scene.links), "drawn": scene.selected(event)} for event in agent.events
+    }
     template = string.Template(files("sb3_skillgraph.explore").joinpath("graph.html").read_text(encoding="utf-8"))
     return template.substitute(
         title=html.escape(title),

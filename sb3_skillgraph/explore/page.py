@@ -181,7 +181,7 @@ class Page:
             self.record.set_text("")
             self.reached_by.set_text("")
             return
-        record = record_of(self.shown.agent, event)
+        record = record_of(self.shown.agent, event, self.scene.links)
         self.event_layer.set_content(self.scene.selected(event))
         self.record.set_text(f"{record['id']}, a {record['kind']} at {record['center']}: options that begin here")
         self.reached_by.set_text(f"Options that lead here: {record['reached_by']}.")
@@ -226,10 +226,9 @@ class Page:
         self.run_layer.set_content(self.scene.trace(progress.points, progress.options))
         if self.renders:
             self.view.set_source(as_jpeg(np.asarray(self.env.render())))
-        n_steps = len(progress.options)
-        self.happened.set_text(f"{n_steps} steps: {progress.options[-1]}")
+        self.happened.set_text(f"{len(progress.options)} steps: {progress.options[-1]}")
         if progress.over:
-            self.happened.set_text(f"goal {'reached' if progress.success else 'missed'} after {n_steps} steps")
+            self.happened.set_text(progress.outcome)
             self._stop()
 
     def _stop(self) -> None:

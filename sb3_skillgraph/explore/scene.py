@@ -10,14 +10,13 @@ from sb3_skillgraph.agent import SkillGraphAgent
 from sb3_skillgraph.envs import MazeGeometry
 from sb3_skillgraph.events import Event
 from sb3_skillgraph.plotting import event_links, near_links
-from sb3_skillgraph.plotting.figures import EFFECT, EVENT, WALL, disc_radius, way
-from sb3_skillgraph.plotting.skill_graph import SURE, link_color
+from sb3_skillgraph.plotting.figures import EFFECT, EVENT, GOAL, PLAN, START, WALL, disc_radius, way
+from sb3_skillgraph.plotting.skill_graph import SURE, EventLink, link_color
 
 #: Pixels of the longer side.
 SIDE = 720
 #: Pixels by which a click may miss an event.
 CLICK_RADIUS = 14
-START, GOAL, PLAN = "#2ca02c", "#d62728", "#111111"
 #: Colours of the runs of an episode, one after the other; apart for the colour-blind (Tol's bright scheme).
 _RUNS = ("#4477aa", "#ee6677", "#228833", "#ccbb44", "#66ccee", "#aa3377")
 
@@ -87,6 +86,8 @@ class Scene:
         self.frame = Frame.of(agent, geometry, dims)
         self.geometry = geometry if dims == (0, 1) else None
         self.radius = disc_radius(agent) * self.frame.scale
+        self.centers = {event.id: event.center for event in agent.events}
+        self.links = sorted(event_links(agent), key=lambda link: link.success_probability)  # the surest on top
 
     def floor(self) -> str:
         """Draw the walls."""
@@ -100,11 +101,7 @@ class Scene:
 
     def graph(self) -> str:
         """Draw the events, and of each the shortest few walks, by the success that is expected of them."""
-        centers = {event.id: event.center for event in self.agent.events}
-        links = sorted(near_links(event_links(self.agent)), key=lambda link: link.success_probability)
-        lines = [
-            self.line(way(self.geometry, *self._ends(centers[u], centers[v])), link_color(p), 1.4) for u, v, p, _ in links
-        ]
+        lines = [self._link(link, 1.4) for link in near_links(self.links)]
         return "".join([*lines, *(self.event(event) for event in self.agent.events)])
 
     def growing(self, centers: Sequence[Sequence[float]], links: Sequence[tuple[int, int]]) -> str:
@@ -125,13 +122,8 @@ class Scene:
 
     def selected(self, event: Event) -> str:
         """Draw an event's ball, and all walks that begin in it, by what is expected of them."""
-        centers = {other.id: other.center for other in self.agent.events}
-        links = [link for link in event_links(self.agent) if link.source == event.id]
-        lines = [
-            self.line(way(self.geometry, *self._ends(event.center, centers[v])), link_color(p), 3.0)
-            for _, v, p, _ in sorted(links, key=lambda link: link.success_probability)
-            if p >= SURE
-        ]
+        sure = [link for link in self.links if link.source == event.id and link.success_probability >= SURE]
+        lines = [self._link(link, 3.0) for link in sure]
         return "".join([*lines, self.disc(event.center, EFFECT)])
 
     def ends(self, start: np.ndarray, goal: np.ndarray) -> str:
@@ -146,8 +138,7 @@ class Scene:
         :param path: the plan's
         :param dashes: how it is dashed
         """
-        centers = {event.id: event.center for event in self.agent.events}
-        stops = [start, *(centers[id] for id in path if id in centers), goal]
+        stops = [start, *(self.centers[id] for id in path if id in self.centers), goal]
         legs = [way(self.geometry, *self._ends(*leg)) for leg in itertools.pairwise(stops)]
         return self.line(np.concatenate(legs), PLAN, 2.5, f' stroke-dasharray="{dashes}"')
 
@@ -184,6 +175,10 @@ class Scene:
     def _ends(self, begin: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         dims = list(self.frame.dims)
         return begin[dims], end[dims]
+
+    def _link(self, link: EventLink, width: float) -> str:
+        ends = self._ends(self.centers[link.source], self.centers[link.target])
+        return self.line(way(self.geometry, *ends), link_color(link.success_probability), width)
 
     def line(self, points: np.ndarray, color: str, width: float, more: str = "") -> str:
         """Draw a line through points of the two dimensions, shape ``(n, 2)``."""

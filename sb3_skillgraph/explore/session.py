@@ -1,6 +1,6 @@
 """One visitor of an agent: a start, a goal, the plan, and what happens when it is followed."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import gymnasium as gym
@@ -9,7 +9,8 @@ import numpy as np
 from sb3_skillgraph.agent import SkillGraphAgent
 from sb3_skillgraph.events import Event
 from sb3_skillgraph.plan import Plan, next_best
-from sb3_skillgraph.plotting import event_links
+from sb3_skillgraph.plotting.plan import follow
+from sb3_skillgraph.plotting.skill_graph import EventLink
 
 
 class Progress(NamedTuple):
@@ -25,6 +26,11 @@ class Progress(NamedTuple):
     options: list[str]
     over: bool
     success: bool
+
+    @property
+    def outcome(self) -> str:
+        """What has happened, in words, when it is over."""
+        return f"goal {'reached' if self.success else 'missed'} after {len(self.options)} steps"
 
 
 class Session:
@@ -83,20 +89,12 @@ class Session:
 
     def go(self) -> Iterator[Progress]:
         """Follow the plan in the environment, a step at a time."""
-        observation = self._observation = self._begin(self.start, self.goal)
-        told = observation["desired_goal"]
-        points, options = [np.array(observation["achieved_goal"], dtype=np.float64)], []
-        state: tuple[np.ndarray, ...] | None = None
-        success = over = self.agent.metric.reached(points[0], self.goal)
-        while not over:
-            action, state = self.agent.predict({**observation, "desired_goal": told}, state=state, deterministic=True)
-            assert state is not None
-            options += self.agent.running(state)
-            observation, _, terminated, truncated, info = self.env.step(action)
-            points.append(np.array(observation["achieved_goal"], dtype=np.float64))
-            success = self.agent.metric.reached(points[-1], self.goal)
-            over = success or terminated or truncated or bool(info.get("stuck"))
-            yield Progress(np.stack(points), options, over, success)
+        self._observation = self._begin(self.start, self.goal)
+        points, options = [np.array(self._observation["achieved_goal"], dtype=np.float64)], []
+        for step in follow(self.agent, self.env, self._observation):
+            points.append(step.point)
+            options.append(step.option)
+            yield Progress(np.stack(points), options, step.over, step.reached)
 
     def close(self) -> None:
         """Let go of the environment."""
@@ -108,11 +106,12 @@ def promised(plan: Plan) -> str:
     return f"probability {plan.success_probability:.0%}, about {plan.expected_steps:.0f} steps"
 
 
-def record_of(agent: SkillGraphAgent, event: Event) -> dict[str, Any]:
+def record_of(agent: SkillGraphAgent, event: Event, links: Sequence[EventLink]) -> dict[str, Any]:
     """Return what is known of an event, of the options that lead to it, and of those that begin there.
 
     :param agent: the agent
     :param event: one of its events
+    :param links: all of the agent's links
     :return: ``id``, ``kind``, ``center``; ``reached_by``: in words, the options that lead to it and the events in which they
         can begin; ``rows``: of each option that begins there its id, where it leads, runs that succeeded and failed, what is
         expected of it, and where its runs landed
@@ -120,7 +119,7 @@ def record_of(agent: SkillGraphAgent, event: Event) -> dict[str, Any]:
     graph = agent.graph.nx
     leading = [id for id, vertex in graph.nodes(data=True) if vertex.get("target") == event.id]
     reached_by = "; ".join(f"{id} can begin in {', '.join(graph.predecessors(id)) or 'no event yet'}" for id in leading)
-    expected = {link.target: link for link in event_links(agent) if link.source == event.id}
+    expected = {link.target: link for link in links if link.source == event.id}
     rows = []
     for option in graph.successors(event.id):
         target = graph.nodes[option].get("target")

@@ -16,7 +16,7 @@ from sb3_skillgraph.explore.session import Progress, Session, promised
 from sb3_skillgraph.files import PARTIAL
 from sb3_skillgraph.plan import Plan
 from sb3_skillgraph.plotting import Trajectory
-from sb3_skillgraph.plotting.figures import disc_radius, draw_floor, project
+from sb3_skillgraph.plotting.figures import GOAL, disc_radius, draw_floor, project
 from sb3_skillgraph.plotting.plan import draw_planned
 
 #: Pictures a second; sides of both halves, in pixels; how long the last picture stays, in pictures.
@@ -48,7 +48,7 @@ def record(agent: SkillGraphAgent, env: gym.Env, path: Path, seed: int = 0) -> s
                 frame = np.concatenate([rendered(env), canvas.draw(progress)], axis=1)
                 for _ in range(LAST if progress.over else 1):
                     writer.append_data(frame)
-                told = _told(plan, progress)
+                told = f"promised: {promised(plan)}; happened: {progress.outcome}"
         if not told:
             raise ValueError("The goal is where the start is: choose another --seed.")
         partial.replace(path)
@@ -86,11 +86,6 @@ def _writer(path: Path) -> Any:
         ) from error
 
 
-def _told(plan: Plan, progress: Progress) -> str:
-    reached = "reached" if progress.success else "missed"
-    return f"promised: {promised(plan)}; happened: goal {reached} after {len(progress.options)} steps"
-
-
 class _Canvas:
     """The maze and the plan, drawn once, and on it where the agent has been."""
 
@@ -103,16 +98,14 @@ class _Canvas:
         draw_floor(axes, geometry, centers, 2.0 * disc_radius(agent))
         axes.plot(*project(agent.graph.centers).T, "o", color="#999999", markersize=2)
         draw_planned(axes, agent, geometry, Trajectory(session.start[None], [], session.goal, False), plan)
-        axes.plot(*project(session.goal[None]).T, "*", color="#d62728", markersize=12)
+        axes.plot(*project(session.goal[None]).T, "*", color=GOAL, markersize=12)
         self.title = axes.set_title("", fontsize=9)
         (self.trace,) = axes.plot([], [], color="#4477aa", linewidth=2.5, zorder=9)
         (self.agent,) = axes.plot([], [], "o", color="#ffffff", markeredgecolor="#111111", markeredgewidth=2, zorder=10)
 
     def draw(self, progress: Progress) -> np.ndarray:
         """Return the picture, uint8 of shape ``(SIDE, SIDE, 3)``."""
-        happened = f"step {len(progress.options)}: {progress.options[-1]}"
-        if progress.over:
-            happened = f"goal {'reached' if progress.success else 'missed'} after {len(progress.options)} steps"
+        happened = progress.outcome if progress.over else f"step {len(progress.options)}: {progress.options[-1]}"
         self.title.set_text(f"Promised: {promised(self.plan)}\nHappened: {happened}")
         self.trace.set_data(*project(progress.points).T)
         self.agent.set_data(*project(progress.points[-1:]).T)

@@ -14,6 +14,7 @@ from sb3_skillgraph.envs import MazeGeometry
 
 # Colours that remain apart for the colour-blind; every figure means the same thing by them.
 WALL, REGION, VISITED, EFFECT, EVENT = "#757575", "#9ecae1", "#969696", "#e6550d", "#111111"
+START, GOAL, PLAN = "#2ca02c", "#d62728", "#111111"
 
 #: Drawing order, from the floor up.
 Z_REGION, Z_VISITED, Z_WALL, Z_EFFECT, Z_LINK, Z_EVENT, Z_LABEL = range(1, 8)

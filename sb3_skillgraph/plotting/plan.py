@@ -1,6 +1,7 @@
 """One plan, and what happened when it was followed: which option took the agent where (section 3.3)."""
 
 import itertools
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import gymnasium as gym
@@ -16,7 +17,6 @@ from sb3_skillgraph.plotting import figures
 
 _PALETTE = colormaps["tab20"].colors  # type: ignore[attr-defined]
 _OPTION_COLORS = (*_PALETTE[::2], *_PALETTE[1::2])  # the strong ones first: as many as runs are named, all different
-_GOAL_COLOR, _START_COLOR, _PLAN_COLOR = "#d62728", "#2ca02c", "#111111"
 #: Runs of options that the legend names; more would not fit.
 MAX_NAMED = 14
 
@@ -36,6 +36,21 @@ class Trajectory(NamedTuple):
     success: bool
 
 
+class FollowedStep(NamedTuple):
+    """A step of an agent on its way to a goal.
+
+    :param point: where it led, shape ``(goal_dim,)``
+    :param option: id of the option that ran
+    :param over: whether the episode is over
+    :param reached: whether the goal is reached
+    """
+
+    point: np.ndarray
+    option: str
+    over: bool
+    reached: bool
+
+
 def run_plan(
     agent: SkillGraphAgent, env: gym.Env, start: np.ndarray | None = None, goal: np.ndarray | None = None
 ) -> tuple[Trajectory, Plan]:
@@ -53,18 +68,32 @@ def run_plan(
     plan = agent.plan(observation)
     target = np.array(observation["desired_goal"], dtype=np.float64)
     points = [np.array(observation["achieved_goal"], dtype=np.float64)]
-    options: list[str] = []
+    steps = list(follow(agent, env, observation))
+    points += [step.point for step in steps]
+    reached = agent.metric.reached(points[-1], target)
+    return Trajectory(np.stack(points), [step.option for step in steps], target, reached), plan
+
+
+def follow(agent: SkillGraphAgent, env: gym.Env, observation: dict[str, np.ndarray]) -> Iterator[FollowedStep]:
+    """Let an agent go to a goal, a step at a time, until it is there, the episode ends, or the agent is stuck.
+
+    :param agent: the agent
+    :param env: a goal environment whose episode has begun
+    :param observation: what it showed then; its goal is pursued to the end
+    :return: the steps; none if the agent is there from the beginning
+    """
+    goal = observation["desired_goal"]
+    target = np.array(goal, dtype=np.float64)
     state: tuple[np.ndarray, ...] | None = None
-    reached = over = agent.metric.reached(points[0], target)
+    over = agent.metric.reached(np.array(observation["achieved_goal"], dtype=np.float64), target)
     while not over:
-        action, state = agent.predict(observation, state=state, deterministic=True)
+        action, state = agent.predict({**observation, "desired_goal": goal}, state=state, deterministic=True)
         assert state is not None
-        options += agent.running(state)
         observation, _, terminated, truncated, info = env.step(action)
-        points.append(np.array(observation["achieved_goal"], dtype=np.float64))
-        reached = agent.metric.reached(points[-1], target)
+        point = np.array(observation["achieved_goal"], dtype=np.float64)
+        reached = agent.metric.reached(point, target)
         over = reached or terminated or truncated or bool(info.get("stuck"))
-    return Trajectory(np.stack(points), options, target, reached), plan
+        yield FollowedStep(point, agent.running(state)[0], over, reached)
 
 
 def plot_plan(
@@ -89,11 +118,11 @@ def plot_plan(
     draw_planned(axes, agent, geometry, trajectory, plan)
     _draw_runs(axes, agent, trajectory)
     start, goal = figures.project(np.stack([trajectory.points[0], trajectory.goal]))
-    axes.plot(*start, "o", color=_START_COLOR, markersize=10, markeredgecolor="white", zorder=figures.Z_LABEL, label="start")
+    axes.plot(*start, "o", color=figures.START, markersize=10, markeredgecolor="white", zorder=figures.Z_LABEL, label="start")
     figures.draw_disc(
-        axes, trajectory.goal, figures.disc_radius(agent), facecolor=_GOAL_COLOR, alpha=0.2, zorder=figures.Z_REGION
+        axes, trajectory.goal, figures.disc_radius(agent), facecolor=figures.GOAL, alpha=0.2, zorder=figures.Z_REGION
     )
-    axes.plot(*goal, "*", color=_GOAL_COLOR, markersize=15, markeredgecolor="white", zorder=figures.Z_LABEL, label="goal")
+    axes.plot(*goal, "*", color=figures.GOAL, markersize=15, markeredgecolor="white", zorder=figures.Z_LABEL, label="goal")
     happened = "reached" if trajectory.success else "missed"
     axes.set_title(
         f"Promised: goal reached with probability {plan.success_probability:.0%}, in about {plan.expected_steps:.0f} steps\n"
@@ -119,7 +148,7 @@ def draw_planned(
     stops = [trajectory.points[0], *(event.center for event in planned), trajectory.goal]
     axes.plot(
         *np.concatenate([figures.way(geometry, *ends) for ends in itertools.pairwise(stops)]).T,
-        color=_PLAN_COLOR,
+        color=figures.PLAN,
         linestyle="--",
         linewidth=1.0,
         zorder=figures.Z_EVENT,
@@ -131,7 +160,7 @@ def draw_planned(
             event.center,
             figures.disc_radius(agent),
             facecolor="none",
-            edgecolor=_PLAN_COLOR,
+            edgecolor=figures.PLAN,
             linewidth=0.7,
             alpha=0.5,
             zorder=figures.Z_EVENT,
