@@ -23,6 +23,7 @@ from sb3_skillgraph.experiments.opening import (
     add_agent,
     add_command,
     add_env_kwargs,
+    add_seed,
     check_env_id,
     find_run,
     load_agent,
@@ -87,6 +88,7 @@ def _add_train(commands: Any) -> None:
         "example:\n  sb3-skillgraph train SkillGraph/PointMazeUMaze-v0 --steps 50000 --out runs/umaze\n"
         "  sb3-skillgraph train SkillGraph/ToyMaze-v0 --hyperparams salience=rrt policy_kwargs='{net_arch: [64, 64]}'",
     )
+    add_seed(command)
     command.add_argument("env", metavar="ENV", help="environment id; 'package:Name-v0' imports the package first")
     command.add_argument("--steps", type=positive, help="environment steps (default: the environment's entry)")
     command.add_argument("--out", type=Path, help="folder for the results (default: runs/<environment>-seed<seed>)")
@@ -121,6 +123,7 @@ def _add_evaluate(commands: Any) -> None:
         "experience.zip of the run.\n\n"
         "example:\n  sb3-skillgraph evaluate runs/umaze --pairs 100",
     )
+    add_seed(command)
     add_agent(command)
     command.add_argument("--pairs", type=positive, default=100, help="pairs of start and goal (default: 100)")
     command.add_argument("--adapt", type=positive, default=0, metavar="STEPS", help="steps of adaptation per pair")
@@ -137,6 +140,7 @@ def _add_plot(commands: Any) -> None:
         "OUT receives skill_graph.png and plan.png; --seed chooses start and goal of the plan.\n\n"
         "example:\n  sb3-skillgraph plot runs/umaze --out runs/umaze",
     )
+    add_seed(command)
     add_agent(command)
     command.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the pictures")
 
@@ -152,6 +156,7 @@ def _add_demo(commands: Any) -> None:
         "one core.\n\n"
         "example:\n  sb3-skillgraph demo --out runs/demo",
     )
+    add_seed(command)
     command.add_argument("--steps", type=positive, default=DEMO_STEPS, help=f"environment steps (default: {DEMO_STEPS})")
     command.add_argument("--pairs", type=positive, default=DEMO_PAIRS, help=f"pairs of start and goal (default: {DEMO_PAIRS})")
     command.add_argument("--out", type=Path, default=Path("runs/demo"), help="folder for the results (default: runs/demo)")

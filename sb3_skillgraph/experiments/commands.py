@@ -12,6 +12,7 @@ from rich.table import Table
 
 from sb3_skillgraph.experiments.console import UserError, for_people, positive
 from sb3_skillgraph.experiments.figures import redraw
+from sb3_skillgraph.experiments.opening import add_command
 from sb3_skillgraph.experiments.plan import RunSpec, load_plan
 from sb3_skillgraph.experiments.runner import ERROR, RunStatus, by_method, compare, status
 from sb3_skillgraph.experiments.summary import estimate
@@ -73,10 +74,7 @@ def add_figure(commands: Any) -> None:
 
 
 def _add(commands: Any, name: str, run: Any, summary: str, detail: str) -> argparse.ArgumentParser:
-    command: argparse.ArgumentParser = commands.add_parser(
-        name, help=summary, description=f"{summary}\n\n{detail}", formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    command.set_defaults(run=run)
+    command = add_command(commands, name, run, summary, detail)
     _add_plan(command)
     return command
 

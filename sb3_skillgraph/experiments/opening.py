@@ -27,8 +27,15 @@ def add_command(commands: Any, name: str, run: Any, summary: str, detail: str) -
         name, help=summary, description=f"{summary}\n\n{detail}", formatter_class=argparse.RawDescriptionHelpFormatter
     )
     command.set_defaults(run=run)
-    command.add_argument("--seed", type=int, default=0, help="seed of everything random (default: 0)")
     return command
+
+
+def add_seed(command: argparse.ArgumentParser) -> None:
+    """Add the seed of a command that draws something.
+
+    :param command: its parser
+    """
+    command.add_argument("--seed", type=int, default=0, help="seed of everything random (default: 0)")
 
 
 def add_env_kwargs(command: argparse.ArgumentParser) -> None:

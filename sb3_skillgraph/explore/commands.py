@@ -11,7 +11,7 @@ import gymnasium as gym
 
 from sb3_skillgraph.envs import geometry_of
 from sb3_skillgraph.experiments.console import UserError, for_people, positive
-from sb3_skillgraph.experiments.opening import add_agent, add_command, find_run, load_agent, make_env
+from sb3_skillgraph.experiments.opening import add_agent, add_command, add_seed, find_run, load_agent, make_env
 from sb3_skillgraph.experiments.run_folder import read_json
 from sb3_skillgraph.explore.export import export
 from sb3_skillgraph.explore.video import record
@@ -69,6 +69,7 @@ def add_video(commands: Any) -> None:
         "example:\n  sb3-skillgraph video runs/umaze --out umaze.gif",
     )
     add_agent(command)
+    add_seed(command)
     command.add_argument("--out", type=Path, required=True, metavar="FILE", help="file.mp4 or file.gif")
 
 
