@@ -1,6 +1,6 @@
 """Few-shot adaptation: goals behind a door that opens after training (section 3.3).
 
-    python -m benchmarks.few_shot --seeds 0 1 2 --out benchmarks/results/few_shot.json
+    python -m benchmarks.few_shot --seeds 0 1 2
 
 Each seed trains an agent in a maze whose right half is shut off. Then the door opens. For each of some goals behind it a
 copy of the agent adapts, a few thousand environment steps at a time, always from the start it was trained from; after
@@ -20,7 +20,7 @@ import numpy as np
 import torch as th
 from joblib import Parallel, delayed
 
-from benchmarks.zero_shot import summary
+from benchmarks.collect import RESULTS, Row, commit, write
 from sb3_skillgraph import SkillGraphAgent, __version__
 from sb3_skillgraph.envs import MazeGeometry, MazeMap
 from sb3_skillgraph.evaluation import Predictor, run_pair
@@ -113,22 +113,19 @@ def main() -> None:
     parser.add_argument("--old-pairs", type=int, default=50)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument("--jobs", type=int, default=2)
-    parser.add_argument("--out", type=pathlib.Path, required=True)
+    parser.add_argument("--out", type=pathlib.Path, default=RESULTS / "few_shot", help="folder of the table")
     args = parser.parse_args()
-    runs = []
-    for run in Parallel(n_jobs=args.jobs, return_as="generator")(delayed(run_seed)(args, seed) for seed in args.seeds):
-        runs.append(run)
+    runs = Parallel(n_jobs=args.jobs, return_as="generator")(delayed(run_seed)(args, seed) for seed in args.seeds)
+    rows: list[Row] = []
+    for run in runs:
         print(json.dumps({name: run[name] for name in ("seed", "curve", "old_before", "old_after")}), flush=True)
-        document = {
-            "command": "python -m benchmarks.few_shot " + shlex.join(sys.argv[1:]),
-            "version": __version__,
-            "steps": list(range(0, args.total + 1, args.stretch)),
-            "success_rate": [summary([r["curve"][i] for r in runs]) for i in range(len(run["curve"]))],
-            "old_pairs_lost": summary([r["old_before"] - r["old_after"] for r in runs], lowest=-1.0),
-            "runs": runs,
-        }
-        args.out.parent.mkdir(parents=True, exist_ok=True)
-        args.out.write_text(json.dumps(document, indent=1) + "\n")
+        for i, rate in enumerate(run["curve"]):
+            row = {"seed": run["seed"], "steps": args.steps, "extra_steps": i * args.stretch, "success_rate": rate}
+            old = {"old_pairs_before": run["old_before"], "old_pairs_after": run["old_after"]}
+            rows.append({**row, **old, "version": __version__, "commit": commit()})
+    args.out.mkdir(parents=True, exist_ok=True)
+    write(args.out / "runs.csv", rows)
+    (args.out / "command.txt").write_text("python -m benchmarks.few_shot " + shlex.join(sys.argv[1:]) + "\n")
 
 
 if __name__ == "__main__":

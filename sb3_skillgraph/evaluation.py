@@ -6,12 +6,11 @@ from typing import Any, NamedTuple, Protocol
 
 import gymnasium as gym
 import numpy as np
-from gymnasium import spaces
 from tqdm import tqdm
 
 from sb3_skillgraph.agent import SkillGraphAgent
 from sb3_skillgraph.envs import MazeGeometry
-from sb3_skillgraph.goal_env import env_metric
+from sb3_skillgraph.goal_env import metric_of
 from sb3_skillgraph.planning import DIRECT
 
 
@@ -290,10 +289,7 @@ def run_pair(agent: Predictor, env: gym.Env, start: np.ndarray | None, goal: np.
 
 def _judge(agent: Predictor, env: gym.Env) -> Callable[[Any, dict[str, Any]], bool]:
     """Return what tells from an observation and an info whether the goal is reached."""
-    if not isinstance(env.observation_space, spaces.Dict) or "desired_goal" not in env.observation_space.spaces:
-        raise ValueError(f"Goals are reached in goal environments (Dict observations), and {env} is none.")
-    goal_dim = len(env.observation_space["desired_goal"].sample())
-    metric = env_metric(lambda name: env.get_wrapper_attr(name) if env.has_wrapper_attr(name) else None, goal_dim)
+    metric = metric_of(env)
     if metric is None:
         metric = getattr(agent, "metric", None)
 

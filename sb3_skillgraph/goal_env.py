@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, is_vecenv_wrapped, unwrap_vec_normalize
@@ -190,6 +191,18 @@ def env_metric(get: Callable[[str], Any], goal_dim: int) -> Metric | None:
     if turn is not None and goal_dim == POSE_DIM and radius is not None:
         return _pose_metric(get, radius, turn)
     return None if radius is None else as_metric(radius)
+
+
+def metric_of(env: gym.Env) -> Metric | None:
+    """Return when one environment counts a goal as reached; None if it does not tell.
+
+    :param env: a goal environment
+    :raises ValueError: if it is none, or what it tells is no metric
+    """
+    if not isinstance(env.observation_space, spaces.Dict) or "desired_goal" not in env.observation_space.spaces:
+        raise ValueError(f"Goals are reached in goal environments (Dict observations), and {env} is none.")
+    goal_dim = len(env.observation_space["desired_goal"].sample())
+    return env_metric(lambda name: env.get_wrapper_attr(name) if env.has_wrapper_attr(name) else None, goal_dim)
 
 
 def _pose_metric(get: Callable[[str], Any], radius: float, turn: float) -> Metric:

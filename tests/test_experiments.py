@@ -1,7 +1,5 @@
 """Many runs on disk: what is skipped, resumed, refused and reported."""
 
-import csv
-import importlib
 import json
 import os
 import shutil
@@ -24,7 +22,7 @@ from filelock import FileLock
 from imageio.v3 import imread
 
 from sb3_skillgraph.cli import main
-from sb3_skillgraph.experiments import RunSpec, compare, figures, learners, load_plan, run, runner, status
+from sb3_skillgraph.experiments import RunSpec, compare, figures, learners, load_plan, run, runner, status, testing
 from sb3_skillgraph.experiments.figures import method_curves, practice_curves
 from sb3_skillgraph.experiments.run_folder import checkpoints, read_progress
 from sb3_skillgraph.experiments.summary import estimate, interquartile_mean
@@ -40,7 +38,7 @@ SMALL_NETS = {
 
 
 def spec(algorithm: str = "skill_graph", steps: int = 600, **changes: Any) -> RunSpec:
-    arguments = SMALL_NETS if algorithm in ("skill_graph", "straight_on", "recipe") else {}
+    arguments = SMALL_NETS if algorithm in ("skill_graph", "recipe") else {}
     values: dict[str, Any] = dict(check_every=200, pairs=3, final_pairs=4, arguments=arguments, seed=0, test_pairs=0)
     return RunSpec(algorithm, "toy", algorithm=algorithm, env_id=TOY, steps=steps, **{**values, **changes})
 
@@ -71,23 +69,14 @@ def test_the_plans_of_the_benchmarks_can_be_read(file: Path) -> None:
     assert load_plan(file)
 
 
-def test_what_the_benchmarks_compare_is_in_their_plans(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(str(PLANS[0].parents[1]))
-    order = importlib.import_module("benchmarks.compare_table").ORDER
-    methods = {spec.method for file in PLANS for spec in load_plan(file)}
-    assert {method for pair in order for method in pair} <= methods
-
-
 # -- one run ----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    "algorithm", ["skill_graph", "straight_on", "uvfa", "her", "recipe", "covering_options", "random_walk"]
-)
+@pytest.mark.parametrize("algorithm", ["skill_graph", "uvfa", "her", "recipe", "covering_options", "random_walk"])
 def test_a_run_leaves_everything_and_is_not_done_again(
     algorithm: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(runner, "STRETCH", 150)
+    monkeypatch.setattr(testing, "STRETCH", 150)
     arguments: dict[str, dict[str, Any]] = {
         "covering_options": {"n_options": 2, "option_updates": 20, "batch_size": 32},
         **{name: {"buffer_size": 2_000} for name in ("uvfa", "her")},  # SB3 saves and loads all of it
@@ -150,14 +139,14 @@ def test_a_run_goes_on_where_its_checkpoint_is(tmp_path: Path, monkeypatch: pyte
 
 
 def test_others_begin_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def killed(self: Any, n_steps: int) -> Any:
+    def killed(policy: Any, spec: RunSpec, n_steps: int) -> Any:
         if n_steps == 400:
             raise Killed
-        return test(self, n_steps)
+        return test(policy, spec, n_steps)
 
-    test = runner._Run._test
+    test = runner.test_policy
     with monkeypatch.context() as patch:
-        patch.setattr(runner._Run, "_test", killed)
+        patch.setattr(runner, "test_policy", killed)
         with pytest.raises(Killed):
             run(spec("uvfa"), tmp_path)
     assert run(spec("uvfa"), tmp_path) == "done"
@@ -185,7 +174,7 @@ def test_what_is_done_is_not_taken_for_something_else(tmp_path: Path) -> None:
 
 
 def test_a_run_with_other_recommended_settings_is_something_else(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    this = spec("straight_on")
+    this = spec()
     assert run(this, tmp_path) == "done"
     config = json.loads((this.folder(tmp_path) / "config.json").read_text())
     assert config["resolved"].items() >= {**this.arguments, "policy": "MultiInputPolicy"}.items()
@@ -516,22 +505,6 @@ def test_stored_results_without_agents_say_so(
     assert main(["figure", "6", *command]) == 0
     assert main(["figure", "3", *command]) == 2
     assert "no finished run of a skill graph" in capsys.readouterr().err
-
-
-def test_the_benchmarks_table_sums_up_what_is_done(
-    runs: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.syspath_prepend(str(PLANS[0].parents[1]))
-    table = importlib.import_module("benchmarks.compare_table")
-    monkeypatch.setattr(sys, "argv", ["compare_table", *map(str, runs)])
-    table.main()
-    lines = capsys.readouterr().out.splitlines()
-    assert len(lines) == 2 + 3
-    with (runs[1] / "plan_summary.csv").open() as file:
-        rows = {row["method"]: float(row["mean"]) for row in csv.DictReader(file)}
-    done = {s.method: json.loads((s.folder(runs[1]) / "done.json").read_text())["success_rate"] for s in load_plan(runs[0])}
-    assert rows == pytest.approx(done, abs=1e-4)
-    assert list(rows.values()) == sorted(rows.values(), reverse=True)
 
 
 def test_compare_and_status_on_the_command_line(runs: tuple[Path, Path], capsys: pytest.CaptureFixture[str]) -> None:

@@ -7,8 +7,8 @@ import numpy as np
 from stable_baselines3 import DDPG, HerReplayBuffer
 from stable_baselines3.common.noise import NormalActionNoise
 
+from sb3_skillgraph.goal_env import metric_of
 from sb3_skillgraph.memory.replay import OptionRule
-from sb3_skillgraph.metric import Ball
 from sb3_skillgraph.options.option import goal_rule
 
 #: What the agent's own options learn with, for the sake of comparison; the discount is the paper's.
@@ -142,19 +142,24 @@ def make_uvfa(env: gym.Env, *, seed: int | None = None, goal_freq: int = 30, **k
 def make_her(env: gym.Env, *, seed: int | None = None, **kwargs: Any) -> DDPG:
     """Build DDPG with hindsight experience replay (Andrychowicz et al. 2017): a new goal every episode, -1 a step.
 
-    :param env: a goal environment whose episodes end at the goal
+    :param env: a goal environment whose episodes end at the goal; one without ``terminate_on_success`` is taken as it comes,
+        with its own reward
     :param seed: of everything random
     :param kwargs: arguments of ``stable_baselines3.DDPG`` that differ from ``SETTINGS``
     """
-    rule = goal_rule(Ball(env.get_wrapper_attr("success_radius")))
+    if env.has_wrapper_attr("terminate_on_success"):
+        metric = metric_of(env)
+        assert metric is not None  # it tells by what it ends
+        env = OptionTask(env, goal_rule(metric))
     # HER samples complete episodes only, so that the first one must be over before learning starts.
-    first_episode = int(env.get_wrapper_attr("max_steps")) if env.has_wrapper_attr("max_steps") else 1_000
+    limit = env.spec.max_episode_steps if env.spec is not None else None
+    first_episode = int(env.get_wrapper_attr("max_steps")) if env.has_wrapper_attr("max_steps") else limit or 1_000
     hindsight = dict(
         replay_buffer_class=HerReplayBuffer,
         replay_buffer_kwargs={"n_sampled_goal": 4, "copy_info_dict": True},
         learning_starts=max(1_000, first_episode + 1),
     )
-    return _ddpg(OptionTask(env, rule), seed, {**hindsight, **kwargs})
+    return _ddpg(env, seed, {**hindsight, **kwargs})
 
 
 def _ddpg(env: gym.Env, seed: int | None, kwargs: dict[str, Any]) -> DDPG:

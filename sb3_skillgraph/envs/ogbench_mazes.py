@@ -15,8 +15,6 @@ from sb3_skillgraph.envs.mujoco_mazes import private_temporary_directory
 from sb3_skillgraph.envs.task import GoalTask, Observation
 
 _FULL_STATE = mujoco.mjtState.mjSTATE_INTEGRATION
-#: Where OGBench draws starts and goals of its tasks: this far from the cell's centre at most, on both axes.
-TASK_NOISE = 1.0
 #: By kind of body: numbers of the observation that are its position, the view of it, distance kept from walls.
 _BODIES: dict[str, tuple[int, str, float]] = {"point": (0, "relative", 0.7), "ant": (2, "placed_body", 0.9)}
 
@@ -26,9 +24,9 @@ class OGBenchMazeEnv(GoalTask):
 
     Body, walls and teleporters are OGBench's; what is added is what a goal environment tells: Dict observations with the
     position (x, y) as the achieved goal, a success radius, starts and goals of one's choice. Every episode begins in the
-    cell (1, 1), where OGBench's first task begins, unless ``reset`` is told otherwise. Where a teleporter takes the body
-    is seen on the step that it happens (OGBench shows the old position once more), and is drawn from the environment's
-    own generator (OGBench draws from NumPy's global one).
+    cell (1, 1), where OGBench's first task begins, unless ``reset`` or ``random_start`` says otherwise. Where a teleporter
+    takes the body is seen on the step that it happens (OGBench shows the old position once more), and is drawn from the
+    environment's own generator (OGBench draws from NumPy's global one).
 
     :param name: OGBench's id of the environment
     :param render_mode: None or one of ``metadata["render_modes"]``
@@ -36,12 +34,16 @@ class OGBenchMazeEnv(GoalTask):
         ant)
     :param max_steps: steps after which an episode is truncated
     :param terminate_on_success: whether reaching the goal ends the episode
+    :param random_start: whether episodes begin anywhere, instead of in the cell (1, 1): if they are short, none of them
+        shows a long way
     :raises ImportError: without OGBench
     :raises ValueError: when it is no maze of the point or the ant, or an argument is unusable
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012 (as Gymnasium has it)
     start_noise = 0.1
+    #: Where OGBench draws starts and goals of its tasks: this far from the cell's centre at most, on both axes.
+    task_noise = 1.0
 
     def __init__(
         self,
@@ -50,7 +52,9 @@ class OGBenchMazeEnv(GoalTask):
         success_radius: float | None = None,
         max_steps: int = 1000,
         terminate_on_success: bool = False,
+        random_start: bool = False,
     ) -> None:
+        self.random_start = random_start
         try:
             import ogbench  # noqa: F401 - registers its environments
         except ImportError as error:
@@ -85,10 +89,13 @@ class OGBenchMazeEnv(GoalTask):
 
     @property
     def tasks(self) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
-        """OGBench's tasks: the centres of the cells of start and goal, each drawn ``TASK_NOISE`` around."""
+        """OGBench's tasks: the centres of the cells of start and goal, each drawn up to ``task_noise`` around."""
         return [
             (np.array(task["init_xy"], dtype=float), np.array(task["goal_xy"], dtype=float)) for task in self.maze.task_infos
         ]
+
+    def _draw_start(self) -> NDArray[np.float64]:
+        return self.sample_free(self.np_random) if self.random_start else super()._draw_start()
 
     # -- what GoalTask asks for ---------------------------------------------------------------------------------------
 

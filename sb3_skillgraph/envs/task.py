@@ -133,6 +133,11 @@ class GoalTask(gym.Env[Any, NDArray[np.float32]]):
         """
         return self.geometry.sample_free(rng, self.body_radius)
 
+    def _draw_start(self) -> NDArray[np.float64]:
+        """Draw where an episode begins, shape (2,)."""
+        noise = self.np_random.uniform(-self.start_noise, self.start_noise, size=2)
+        return self.geometry.cell_to_xy(*self.geometry.start_cell) + noise
+
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, dict[str, Any]]:
         """Begin an episode.
 
@@ -146,8 +151,7 @@ class GoalTask(gym.Env[Any, NDArray[np.float32]]):
         """
         given = self._check_options(options or {})
         super().reset(seed=seed)
-        noise = self.np_random.uniform(-self.start_noise, self.start_noise, size=2)
-        start = self.geometry.cell_to_xy(*self.geometry.start_cell) + noise
+        start = self._draw_start()
         goal = self.sample_free(self.np_random)
         self.goal = given.get("goal", goal)
         self._elapsed_steps = 0

@@ -14,7 +14,9 @@ from sb3_skillgraph.experiments.console import UserError, for_people, positive
 from sb3_skillgraph.experiments.figures import redraw
 from sb3_skillgraph.experiments.opening import add_command
 from sb3_skillgraph.experiments.plan import RunSpec, load_plan
-from sb3_skillgraph.experiments.runner import ERROR, RunStatus, by_method, compare, status
+from sb3_skillgraph.experiments.run_folder import ERROR
+from sb3_skillgraph.experiments.runner import compare
+from sb3_skillgraph.experiments.status import RunStatus, by_method, status
 from sb3_skillgraph.experiments.summary import estimate
 from sb3_skillgraph.plotting import save_figure
 

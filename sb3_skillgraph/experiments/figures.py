@@ -13,8 +13,9 @@ from sb3_skillgraph.baselines import random_walk
 from sb3_skillgraph.envs import MazeGeometry
 from sb3_skillgraph.experiments.plan import RunSpec
 from sb3_skillgraph.experiments.run_folder import DONE, STEPS, checkpoints, load_agent, read_json, read_progress
-from sb3_skillgraph.experiments.runner import STRETCH, is_done
+from sb3_skillgraph.experiments.status import is_done
 from sb3_skillgraph.experiments.summary import estimate
+from sb3_skillgraph.experiments.testing import STRETCH
 from sb3_skillgraph.learning.dco import learn_fiedler
 from sb3_skillgraph.plotting import paper_figures as draw
 

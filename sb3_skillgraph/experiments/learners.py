@@ -21,6 +21,7 @@ from sb3_skillgraph.baselines import (
     NewGoals,
     OptionTask,
     RandomWalk,
+    ReplaySearch,
     StraightOn,
     make_her,
     make_uvfa,
@@ -105,6 +106,14 @@ class Learner(ABC):
         :return: what is to be tested: at once, and after every stretch
         """
 
+    def rival(self, algorithm: str, arguments: dict[str, Any] | None = None) -> Predictor:
+        """Return another way to act by what has been learned.
+
+        :param algorithm: one of ``RIVALS``
+        :param arguments: of it
+        """
+        raise NotImplementedError
+
     def summary(self) -> dict[str, float]:
         """Return what else is worth a column."""
         return {}
@@ -114,8 +123,16 @@ class Learner(ABC):
         return None
 
 
-def _check_names(arguments: dict[str, Any], where: str, *takers: Callable[..., Any]) -> None:
-    known = {name for taker in takers for name in signature(taker).parameters} - {"self", "env", "seed", "policy", "kwargs"}
+def check_names(arguments: dict[str, Any], where: str, *takers: Callable[..., Any]) -> None:
+    """Check the names of arguments.
+
+    :param arguments: as a plan gives them
+    :param where: that is, for the message
+    :param takers: what takes them
+    :raises ValueError: if there is one that none of these takes
+    """
+    given = {"self", "env", "agent", "seed", "policy", "kwargs"}
+    known = {name for taker in takers for name in signature(taker).parameters} - given
     for name in arguments:
         if name not in known:
             raise ValueError(f"{where}: unknown argument {name!r}{did_you_mean(str(name), known)}.")
@@ -175,6 +192,10 @@ class SkillGraphLearner(Learner):
             twin.adapt(goal, start=start, total_timesteps=n_steps)
             yield twin
 
+    def rival(self, algorithm: str, arguments: dict[str, Any] | None = None) -> Predictor:
+        """Let the same walker go by something else than the graph."""
+        return RIVALS[algorithm](self.agent, **(arguments or {}))
+
     def summary(self) -> dict[str, float]:
         """Describe the graph, and count how often the agent got stuck."""
         return {f"skillgraph/{name}": value for name, value in self.agent.graph_summary().items()}
@@ -182,21 +203,6 @@ class SkillGraphLearner(Learner):
     def snapshot(self) -> dict[str, Any]:
         """Return events and what joins them."""
         return snapshot(self.agent)
-
-
-class StraightOnLearner(SkillGraphLearner):
-    """The same, tested without its graph: its walker goes straight to every goal."""
-
-    @property
-    def policy(self) -> Predictor:  # type: ignore[override]
-        """What is tested."""
-        return StraightOn(self.agent)
-
-    def practise(self, env: gym.Env, start: np.ndarray, goal: np.ndarray, stretches: list[int]) -> Iterator[Predictor]:
-        """Adapt a copy."""
-        for twin in super().practise(env, start, goal, stretches):
-            assert isinstance(twin, SkillGraphAgent)
-            yield StraightOn(twin)
 
 
 def _checking(every: int, end: int, check: Check) -> Check:
@@ -219,19 +225,24 @@ class _Checks(BaseCallback):
         return True
 
 
+def _ending_at_goals(env_id: str, env_kwargs: dict[str, Any]) -> gym.Env:
+    """Make an environment whose episodes end at goals; other people's are taken as they come."""
+    ours = {"terminate_on_success": True} if env_id.startswith("SkillGraph/") else {}
+    return gym.make(env_id, **{**ours, **env_kwargs})
+
+
 class GoalConditionedLearner(Learner):
     """SB3's DDPG (which is a TD3 to SB3) that is told the goal, with hindsight or without."""
 
     make: Callable[..., TD3]
 
     def __init__(self, env_id: str, env_kwargs: dict[str, Any], seed: int, arguments: dict[str, Any]) -> None:
-        env = gym.make(env_id, **{"terminate_on_success": True, **env_kwargs})
-        self.policy: TD3 = type(self).make(env, seed=seed, **arguments)
+        self.policy: TD3 = type(self).make(_ending_at_goals(env_id, env_kwargs), seed=seed, **arguments)
 
     @classmethod
     def check_arguments(cls, arguments: dict[str, Any], where: str) -> None:
         """They are those of DDPG, and the baseline's own."""
-        _check_names(arguments, where, cls.make, DDPG)
+        check_names(arguments, where, cls.make, DDPG)
 
     def learn(self, begin: int, end: int, every: int, check: Check) -> None:
         """Learn in one go."""
@@ -319,7 +330,7 @@ class CoveringOptionsLearner(Learner):
     """
 
     def __init__(self, env_id: str, env_kwargs: dict[str, Any], seed: int, arguments: dict[str, Any]) -> None:
-        env = gym.make(env_id, **{"terminate_on_success": True, **env_kwargs})
+        env = _ending_at_goals(env_id, env_kwargs)
         name = arguments.get("option_class", "OptionDDPG")
         if name not in _COVERING_CLASSES:
             raise ValueError(f"option_class is {' or '.join(_COVERING_CLASSES)} for covering options, not {name!r}.")
@@ -330,7 +341,7 @@ class CoveringOptionsLearner(Learner):
     @classmethod
     def check_arguments(cls, arguments: dict[str, Any], where: str) -> None:
         """They are those of the class."""
-        _check_names(arguments, where, CoveringOptions)
+        check_names(arguments, where, CoveringOptions)
 
     def learn(self, begin: int, end: int, every: int, check: Check) -> None:
         """Learn in one go."""
@@ -375,7 +386,7 @@ class RandomWalkLearner(Learner):
     @classmethod
     def check_arguments(cls, arguments: dict[str, Any], where: str) -> None:
         """There are none."""
-        _check_names(arguments, where)
+        check_names(arguments, where)
 
     def learn(self, begin: int, end: int, every: int, check: Check) -> None:
         """Only be tested."""
@@ -391,9 +402,11 @@ class RandomWalkLearner(Learner):
             yield self.policy
 
 
+#: Other ways to act by what a skill graph has learned.
+RIVALS: dict[str, Callable[..., Predictor]] = {"straight_on": StraightOn, "replay_search": ReplaySearch}
+
 ALGORITHMS: dict[str, type[Learner]] = {
     "skill_graph": SkillGraphLearner,
-    "straight_on": StraightOnLearner,
     "uvfa": UVFALearner,
     "her": HERLearner,
     "recipe": RecipeLearner,

@@ -10,13 +10,22 @@ import gymnasium as gym
 import yaml
 
 from sb3_skillgraph.envs import find
-from sb3_skillgraph.experiments.learners import ALGORITHMS
+from sb3_skillgraph.experiments.learners import ALGORITHMS, RIVALS, check_names
 from sb3_skillgraph.hyperparams import did_you_mean
 
-_COMMON = ("check_every", "pairs", "final_pairs", "test_pairs", "test_stretches")
+_COMMON = ("check_every", "pairs", "final_pairs", "task_episodes", "test_pairs", "test_stretches")
 _TOP = {"methods": dict, "environments": dict, "seeds": list, **dict.fromkeys(_COMMON, int)}
-_METHOD = {"algorithm": str, "arguments": dict}
-_ENVIRONMENT = {"id": str, "kwargs": dict, "steps": int, "seeds": list, "methods": list, **dict.fromkeys(_COMMON, int)}
+_METHOD = {"algorithm": str, "arguments": dict, "also": dict, "seeds": list}
+_ALSO = {"algorithm": str, "arguments": dict}
+_ENVIRONMENT = {
+    "id": str,
+    "kwargs": dict,
+    "test_kwargs": dict,
+    "steps": int,
+    "seeds": list,
+    "methods": list,
+    **dict.fromkeys(_COMMON, int),
+}
 
 
 @dataclass(frozen=True)
@@ -26,16 +35,20 @@ class RunSpec:
     :param method: its name in the plan
     :param environment: its name in the plan
     :param seed: of everything random; pairs are drawn with ``seed + 1000``
-    :param algorithm: ``skill_graph``, ``straight_on``, ``uvfa``, ``her``, ``recipe``, ``covering_options`` or ``random_walk``
+    :param algorithm: ``skill_graph``, ``uvfa``, ``her``, ``recipe``, ``covering_options`` or ``random_walk``
     :param env_id: id of a ``SkillGraph/*`` environment
     :param steps: environment steps
     :param check_every: steps between tests, after each of which a checkpoint is taken
     :param pairs: pairs of start and goal in these tests
     :param final_pairs: pairs in the last one
+    :param task_episodes: episodes, in each test, of every task that the environment brings (OGBench's do)
     :param test_pairs: pairs with each of which, after that, a copy goes on learning
     :param test_stretches: for how many times 1000 steps, with a test after each
     :param arguments: of the algorithm
     :param env_kwargs: of the environment
+    :param test_kwargs: of the environment in tests, where others are wanted
+    :param also: other ways to act by what a skill graph has learned, tested at the end: name -> ``algorithm``
+        (``straight_on``, ``replay_search``), ``arguments``
     """
 
     method: str
@@ -47,10 +60,13 @@ class RunSpec:
     check_every: int = 10_000
     pairs: int = 20
     final_pairs: int = 100
+    task_episodes: int = 0
     test_pairs: int = 0
     test_stretches: int = 5
     arguments: dict[str, Any] = field(default_factory=dict)
     env_kwargs: dict[str, Any] = field(default_factory=dict)
+    test_kwargs: dict[str, Any] = field(default_factory=dict)
+    also: dict[str, dict[str, Any]] = field(default_factory=dict)
 
     def folder(self, out: Path) -> Path:
         """Return where the run lies in the folder of all runs."""
@@ -64,9 +80,10 @@ class RunSpec:
 def load_plan(path: Path) -> list[RunSpec]:
     """Read a plan.
 
-    :param path: YAML file: ``methods`` (name -> ``algorithm``, ``arguments``), ``environments`` (name -> ``id``,
-        ``kwargs``, ``steps``, and ``seeds`` or ``methods`` where not all are wanted), ``seeds``, and ``check_every``,
-        ``pairs``, ``final_pairs``, ``test_pairs``, ``test_stretches`` for all environments or for one
+    :param path: YAML file: ``methods`` (name -> ``algorithm``, ``arguments``, ``also``, ``seeds``), ``environments`` (name ->
+        ``id``, ``kwargs``, ``test_kwargs``, ``steps``, ``seeds``, ``methods``), ``seeds`` (all where not given), and
+        ``check_every``, ``pairs``, ``final_pairs``, ``task_episodes``, ``test_pairs``, ``test_stretches`` for all
+        environments or for one
     :return: one spec for each run, seed by seed, so that the first results compare all methods
     :raises ValueError: if the file says anything else, or too little
     """
@@ -84,6 +101,8 @@ def load_plan(path: Path) -> list[RunSpec]:
             hint = did_you_mean(method["algorithm"], ALGORITHMS)
             raise ValueError(f"{path}, method {name!r}: unknown algorithm {method['algorithm']!r}{hint}.")
         ALGORITHMS[method["algorithm"]].check_arguments(method.get("arguments", {}), f"{path}, method {name!r}")
+        _check_also(method, f"{path}, method {name!r}")
+        _seeds(method.get("seeds", []), f"{path}, method {name!r}")
     environments = {
         _name(name, path): _checked(value, _ENVIRONMENT, f"{path}, environment {name!r}", required=("id", "steps"))
         for name, value in top["environments"].items()
@@ -105,13 +124,28 @@ def load_plan(path: Path) -> list[RunSpec]:
                 env["id"],
                 env["steps"],
                 arguments=methods[name].get("arguments", {}),
+                also=methods[name].get("also", {}),
                 env_kwargs=env.get("kwargs", {}),
+                test_kwargs=env.get("test_kwargs", {}),
                 **{name: given[name] for given in (top, env) for name in _COMMON if name in given},
             )
             for seed in _seeds(env.get("seeds", top["seeds"]), f"{path}, environment {label!r}")
             for name in env.get("methods", methods)
+            if seed in methods[name].get("seeds", [seed])
         ]
     return specs
+
+
+def _check_also(method: dict[str, Any], where: str) -> None:
+    """Check in which other ways a method is to act."""
+    for name, value in method.get("also", {}).items():
+        rival = _checked(value, _ALSO, f"{where}, {name!r}", required=("algorithm",))
+        if method["algorithm"] != "skill_graph":
+            raise ValueError(f"{where}: only what a skill_graph has learned can act in other ways, too.")
+        if rival["algorithm"] not in RIVALS:
+            hint = did_you_mean(rival["algorithm"], RIVALS)
+            raise ValueError(f"{where}, {name!r}: unknown algorithm {rival['algorithm']!r}{hint}.")
+        check_names(rival.get("arguments", {}), f"{where}, {name!r}", RIVALS[rival["algorithm"]])
 
 
 def _name(name: Any, path: Path) -> str:

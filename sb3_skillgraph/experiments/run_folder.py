@@ -19,7 +19,8 @@ from sb3_skillgraph.files import PARTIAL, sync_folder
 
 AGENT, EXPERIENCE, CONFIG, PROGRESS, DONE = "agent.zip", "experience.zip", "config.json", "progress.csv", "done.json"
 LOCK, UNNAMED = "lock", f"checkpoint{PARTIAL}"  # a checkpoint before it is whole, and after it has been let go
-STEPS = "time/total_timesteps"
+ERROR = "error.txt"
+STEPS, SECONDS = "time/total_timesteps", "time/seconds"
 N_KEPT = 2  # checkpoints: should the newest be damaged, there is another
 T = TypeVar("T")
 

@@ -1,0 +1,163 @@
+"""Search on the replay buffer (Eysenbach et al., 2019) with a skill graph's own walker: the graph's strongest rival."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import torch as th
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import dijkstra
+
+from sb3_skillgraph.agent import SkillGraphAgent
+from sb3_skillgraph.walk_model import timeout
+
+#: Least of what a value may be above its limit, where no number of steps can be told any more.
+LEAST = 1e-6
+
+
+class SearchState(NamedTuple):
+    """What a search passes from step to step, as plain arrays.
+
+    :param waypoints: stored states that are left on the way, by number, shape ``(n,)``; the goal comes after them
+    :param leg: begin and end of the leg that is walked: numbers of stored states, ``n_states`` for the place it was planned
+        from, ``n_states + 1`` for the goal; shape ``(2,)``
+    :param left: environment steps that the leg may still take, shape ``()``
+    :param barred: legs that took too long in this episode, shape ``(m, 2)``
+    """
+
+    waypoints: np.ndarray
+    leg: np.ndarray
+    left: np.ndarray
+    barred: np.ndarray
+
+
+class ReplaySearch:
+    """
+    Plans by Dijkstra over states drawn from an agent's replay buffer, and walks from one to the next.
+
+    Two states are joined if the walker's critic takes the way between them for shorter than ``walk_steps``. A leg that takes
+    more than the time a walk may take is barred for the rest of the episode, and planned around (a deterministic search
+    would repeat it for ever). There are no events, no records and no edges from evidence: distances are what the critic says.
+
+    :param agent: trained, with its replay buffer; point mazes and arms, one environment at a time
+    :param n_states: how many states are drawn
+    :param seed: of that draw
+    :raises ValueError: if there are fewer states
+    """
+
+    def __init__(self, agent: SkillGraphAgent, n_states: int = 1_000, seed: int = 0) -> None:
+        store = agent.parts.store
+        if n_states > len(store):
+            raise ValueError(f"{n_states} states cannot be drawn from {len(store)}; does the agent have its replay buffer?")
+        rng = np.random.default_rng(seed)
+        rows = np.sort(rng.choice(np.arange(store.oldest, store.total), n_states, replace=False))
+        self.agent = agent
+        self.n_states = n_states
+        self.observations = store.column("observation", rows)
+        self.places = store.column("achieved_goal", rows)
+        between = np.stack([self.steps(*here, self.places) for here in zip(self.observations, self.places, strict=True)])
+        np.fill_diagonal(between, np.inf)
+        self._edges = np.argwhere(between < agent.graph.walk_steps)
+        self._weights = between[tuple(self._edges.T)]
+
+    def steps(self, observation: np.ndarray, place: np.ndarray, goal: np.ndarray) -> np.ndarray:
+        """Return how many steps the walker's critic expects a way to take, shape ``(n,)``.
+
+        :param observation: shape ``(observation_dim,)`` or ``(n, observation_dim)``
+        :param place: where that was, shape ``(goal_dim,)`` or ``(n, goal_dim)``
+        :param goal: shape ``(goal_dim,)`` or ``(n, goal_dim)``
+        """
+        parts, gamma = self.agent.parts, self.agent.gamma
+        n = max(len(np.atleast_2d(place)), len(np.atleast_2d(goal)))
+        whole = [np.broadcast_to(array, (n, array.shape[-1])) for array in (observation, place, goal)]
+        seen = parts.runner.view(*whole)
+        actions = parts.runner.actor.act(seen)
+        with th.no_grad():
+            critic = parts.walker.learner.critic
+            values = th.cat(critic(*(th.as_tensor(array, dtype=th.float32) for array in (seen, actions))), dim=1)
+        value = values.min(dim=1).values.numpy() - parts.factory.shaping * self.agent.metric.travel(whole[1], whole[2])
+        # A walk of n steps is paid -1 each: -(1 - gamma^n) / (1 - gamma).
+        return np.asarray(np.log(np.clip(1.0 + (1.0 - gamma) * value, LEAST, 1.0)) / math.log(gamma))
+
+    def plan(
+        self, observation: np.ndarray, place: np.ndarray, goal: np.ndarray, barred: np.ndarray | None = None
+    ) -> list[int] | None:
+        """Return the stored states on the shortest way, by number; None if none leads there.
+
+        :param observation: shape ``(observation_dim,)``
+        :param place: where the agent stands, shape ``(goal_dim,)``
+        :param goal: shape ``(goal_dim,)``
+        :param barred: legs not to take, shape ``(m, 2)``
+        """
+        start, end = self.n_states, self.n_states + 1
+        away = self.steps(observation, place, np.vstack([self.places, goal]))
+        home = self.steps(self.observations, self.places, goal)
+        leaving = np.flatnonzero(away < self.agent.graph.walk_steps)
+        arriving = np.flatnonzero(home < self.agent.graph.walk_steps)
+        edges = np.vstack(
+            [
+                self._edges,
+                np.stack([np.full(len(leaving), start), np.where(leaving == start, end, leaving)], axis=1),
+                np.stack([arriving, np.full(len(arriving), end)], axis=1),
+            ]
+        )
+        weights = np.concatenate([self._weights, away[leaving], home[arriving]])
+        if barred is not None and len(barred):
+            kept = ~(edges[:, None] == barred).all(axis=2).any(axis=1)
+            edges, weights = edges[kept], weights[kept]
+        graph = csr_array((np.maximum(weights, LEAST), tuple(edges.T)), shape=(end + 1, end + 1))
+        _, before = dijkstra(graph, indices=start, return_predecessors=True)
+        if before[end] < 0:
+            return None
+        way = [end]
+        while way[-1] != start:
+            way.append(int(before[way[-1]]))
+        return way[-2:0:-1]
+
+    def predict(
+        self,
+        observation: dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = True,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
+        """
+        Walk towards the next state on the way to ``observation["desired_goal"]``.
+
+        :param observation: one Dict observation
+        :param state: what the last call returned; None at the beginning of an episode
+        :param episode_start: not used
+        :param deterministic: not used: there is no noise
+        :return: an action in the environment's own bounds, and the state to pass back in
+        """
+        place, goal = observation["achieved_goal"], observation["desired_goal"]
+        if state is None:
+            now = self._begin(observation, np.empty((0, 2), dtype=int))
+        else:
+            now = self._go_on(observation, SearchState(*state))
+        target = self.places[now.waypoints[0]] if len(now.waypoints) else goal
+        seen = {"observation": observation["observation"][None], "achieved_goal": place[None]}
+        action = self.agent.parts.walk(seen, target[None])[0]
+        return action, tuple(now._replace(left=now.left - 1))
+
+    def _begin(self, observation: dict[str, np.ndarray], barred: np.ndarray) -> SearchState:
+        """Plan from here."""
+        here = (observation["observation"], observation["achieved_goal"], observation["desired_goal"])
+        way = self.plan(*here, barred)
+        return self._walk(observation, self.n_states, np.array(way or [], dtype=int), barred)
+
+    def _walk(self, observation: dict[str, np.ndarray], begin: int, waypoints: np.ndarray, barred: np.ndarray) -> SearchState:
+        """Begin a leg."""
+        target = self.places[waypoints[0]] if len(waypoints) else observation["desired_goal"]
+        expected = self.steps(observation["observation"], observation["achieved_goal"], target)[0]
+        end = waypoints[0] if len(waypoints) else self.n_states + 1
+        left = int(timeout(min(expected, self.agent.graph.walk_steps)))
+        return SearchState(waypoints, np.array([begin, end]), np.array(left), barred)
+
+    def _go_on(self, observation: dict[str, np.ndarray], state: SearchState) -> SearchState:
+        """Take the next leg after an arrival, and plan anew where a leg took too long."""
+        if len(state.waypoints) and self.agent.metric.reached(observation["achieved_goal"], self.places[state.waypoints[0]]):
+            return self._walk(observation, int(state.waypoints[0]), state.waypoints[1:], state.barred)
+        if state.left <= 0:
+            return self._begin(observation, np.vstack([state.barred, state.leg]))
+        return state
