@@ -191,7 +191,7 @@ def _evaluate(args: argparse.Namespace) -> int:
             raise UserError("--straight-on and --adapt do not go together: only the agent itself adapts.")
         tested = StraightOn(agent) if args.straight_on else agent
         drawn = dict(n_pairs=args.pairs, seed=args.seed, adapt_timesteps=args.adapt)
-        result = evaluate_pairs(tested, env_id, env_kwargs=env_kwargs, progress_bar=True, **drawn)
+        result = evaluate_pairs(tested, env, progress_bar=True, **drawn)
     except NoPairsError as error:
         raise UserError(str(error)) from error
     finally:

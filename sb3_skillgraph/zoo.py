@@ -9,11 +9,14 @@ Everything else is the zoo's: ``-i`` trains an agent further. Hyperparameters ar
 ``hyperparams/skillgraph.yml``, unless ``--conf-file`` names others.
 """
 
+import fnmatch
 import runpy
 import sys
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
+import gymnasium as gym
+import gymnasium_robotics
 import rl_zoo3
 import yaml
 from rl_zoo3.enjoy import enjoy
@@ -38,7 +41,10 @@ def read_hyperparams() -> dict[str, dict[str, Any]]:
     """Return what is recommended, as the zoo wants it: every entry whole, ``default`` for all other environments."""
     document = yaml.safe_load(FILE.read_text(encoding="utf-8"))
     defaults = document.pop("defaults")
-    return {"default": defaults, **{env_id: {**defaults, **entry} for env_id, entry in document.items()}}
+    # Of names with a star the zoo knows nothing.
+    gym.register_envs(gymnasium_robotics)
+    fitting = {entry: fnmatch.filter(gym.registry, entry) or [entry] for entry in document}
+    return {"default": defaults, **{id: {**defaults, **document[entry]} for entry, ids in fitting.items() for id in ids}}
 
 
 #: The zoo reads a module's attribute of this name.

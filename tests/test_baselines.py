@@ -19,6 +19,7 @@ from sb3_skillgraph.baselines import (
     NewGoals,
     OptionTask,
     RandomWalk,
+    ReplaySearch,
     StraightOn,
     make_her,
     make_uvfa,
@@ -236,6 +237,48 @@ def test_straight_on_knows_what_its_agent_learns() -> None:
     before = straight.predict(seen)[0]
     agent.learn(150)
     assert not np.array_equal(straight.predict(seen)[0], before)
+
+
+# -- search on the replay buffer --------------------------------------------------------------------------------------
+
+
+def test_a_search_goes_from_state_to_state_to_the_goal(trained: Any) -> None:
+    search = ReplaySearch(trained, 300, seed=0)
+    here = {"observation": np.array([-1.0, -1.0], dtype=np.float32), "achieved_goal": np.array([-1.0, -1.0], dtype=np.float32)}
+    far = np.array([1.0, 1.0], dtype=np.float32)
+    way = search.plan(here["observation"], here["achieved_goal"], far)
+    assert way, "one walk does not reach that far"
+    places = [here["achieved_goal"], *search.places[way]]
+    seen = [here["observation"], *search.observations[way]]
+    legs = [search.steps(a, b, c)[0] for a, b, c in zip(seen, places, [*places[1:], far], strict=True)]
+    assert max(legs) < trained.graph.walk_steps
+    barred = np.array([[300, way[0]]])
+    assert search.plan(here["observation"], here["achieved_goal"], far, barred) != way, "what was barred is planned around"
+
+
+def test_a_search_reaches_most_of_what_its_agent_does(trained: Any) -> None:
+    search = ReplaySearch(trained, 300, seed=0)
+    result = evaluate_pairs(search, TOY, n_pairs=20, seed=5)
+    assert result.success_rate >= 0.7
+    again = evaluate_pairs(search, TOY, n_pairs=20, seed=5)
+    assert [pair.steps for pair in again.pairs] == [pair.steps for pair in result.pairs], "it keeps nothing between episodes"
+
+
+def test_a_search_bars_a_leg_that_takes_too_long(trained: Any) -> None:
+    search = ReplaySearch(trained, 300, seed=0)
+    place = np.array([-1.0, -1.0], dtype=np.float32)
+    seen = {"observation": place, "achieved_goal": place, "desired_goal": np.array([1.0, 1.0], dtype=np.float32)}
+    state, barred = None, 0
+    for _ in range(2 * trained.graph.walk_steps * 3):
+        _, state = search.predict(seen, state)  # it stands before a wall: nothing it does moves it
+        assert len(state[3]) >= barred
+        barred = len(state[3])
+    assert barred >= 2
+
+
+def test_a_search_wants_a_replay_buffer(trained: Any) -> None:
+    with pytest.raises(ValueError, match="states cannot be drawn from"):
+        ReplaySearch(trained, 10**6)
 
 
 class AnyStart(gym.Wrapper):

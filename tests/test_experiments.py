@@ -389,6 +389,23 @@ def test_workers_share_what_one_of_them_leaves_and_none_minds_a_damaged_folder(t
         ),
         ({"methods": {"dco": {"algorithm": "covering_options", "arguments": {"options": 1}}}}, "unknown argument 'options'"),
         ({"methods": {"walk": {"algorithm": "random_walk", "arguments": {"steps": 1}}}}, "unknown argument 'steps'"),
+        (
+            {"methods": {"walk": {"algorithm": "random_walk", "also": {"x": {"algorithm": "straight_on"}}}}},
+            "only what a skill_graph",
+        ),
+        (
+            {"methods": {"dsg": {"algorithm": "skill_graph", "also": {"x": {"algorithm": "straight"}}}}},
+            "unknown algorithm 'straight'",
+        ),
+        (
+            {
+                "methods": {
+                    "d": {"algorithm": "skill_graph", "also": {"x": {"algorithm": "replay_search", "arguments": {"n": 3}}}}
+                }
+            },
+            "'x': unknown argument 'n'",
+        ),
+        ({"methods": {"walk": {"algorithm": "random_walk", "seeds": [-1]}}}, "a seed must be a whole number"),
         ({"methods": {False: {"algorithm": "random_walk"}}}, "False is no name"),
         ({"methods": {"../walk": {"algorithm": "random_walk"}}}, "'../walk' is no name"),
         ({"environments": {"toy": {"id": "SkillGraph/TyoMaze-v0", "steps": 5}}}, "environment 'toy': .*TyoMaze"),

@@ -6,12 +6,14 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from conftest import TOY
 from gymnasium.wrappers import TransformAction
 
 import sb3_skillgraph.envs.mujoco_mazes  # noqa: F401 (imports gymnasium-robotics, which registers its ants)
 from sb3_skillgraph import SkillGraphAgent, evaluate_pairs
-from sb3_skillgraph.envs import FlattenGoals, HoldAction, PursueGoals, TellStuck, on_its_back
-from sb3_skillgraph.hyperparams import load_hyperparams
+from sb3_skillgraph.envs import AntRecipe, FlattenGoals, HoldAction, PursueGoals, TellStuck, on_its_back
+from sb3_skillgraph.hyperparams import load_hyperparams, make_recommended, recommended_wrapper
+from sb3_skillgraph.metric import Ball
 
 
 class Counter(gym.Env):
@@ -84,6 +86,30 @@ def test_somebody_elses_ant_learns_with_the_shipped_settings(robotics_ant: gym.E
     agent = SkillGraphAgent(env=robotics_ant, event_radius=0.45, seed=0, **settings).learn(120)
     assert agent.parts.store.total == 120
     assert agent.parts.walker.learner._n_updates > 0
+
+
+@pytest.mark.mujoco
+def test_the_recipe_for_ants_is_taken_by_name(robotics_ant: gym.Env) -> None:
+    env = make_recommended("AntMaze_UMaze-v5", {})
+    assert isinstance(env, AntRecipe) and env.spec is not None
+    settings = load_hyperparams("AntMaze_UMaze-v5")
+    assert settings == load_hyperparams("SkillGraph/AntUMaze-v0") and "env_wrapper" not in settings
+    assert load_hyperparams("AntMaze_Large_Diverse_GR-v4") == settings and recommended_wrapper("PointMaze_UMaze-v3") is None
+    # It is what the wrappers make of it one by one.
+    action = np.linspace(-1.0, 1.0, 8, dtype=np.float32)
+    for each in (env, robotics_ant, gym.make(env.spec)):
+        each.reset(seed=3)
+    steps = [each.step(action) for each in (env, robotics_ant)]
+    for key in ("observation", "achieved_goal", "desired_goal"):
+        np.testing.assert_array_equal(steps[0][0][key], steps[1][0][key])
+    assert steps[0][1:4] == steps[1][1:4] and steps[0][4]["stuck"] is False
+    assert env.observation_space["observation"].shape == (27,)
+    settings |= {"learning_starts": 50, "batch_size": 16}
+    del settings["n_timesteps"]
+    agent = SkillGraphAgent(env=env, seed=0, **settings).learn(120)  # radius and view are found
+    assert agent.metric == Ball(0.45) and agent.parts.view_name == "placed_body"
+    with pytest.raises(ValueError, match="AntRecipe is for gymnasium-robotics' AntMaze"):
+        AntRecipe(gym.make(TOY))
 
 
 @pytest.mark.mujoco

@@ -8,7 +8,7 @@ import yaml
 from conftest import TOY
 
 from sb3_skillgraph import SkillGraphAgent, zoo
-from sb3_skillgraph.hyperparams import load_hyperparams
+from sb3_skillgraph.hyperparams import load_hyperparams, recommended_wrapper
 
 pytestmark = pytest.mark.filterwarnings("ignore")
 FOLDER = "dsg/SkillGraph-ToyMaze-v0_1"
@@ -41,10 +41,13 @@ def test_the_zoo_trains_goes_on_enjoys_and_tunes(
 def test_the_zoos_hyperparameters_are_those_of_the_command_line() -> None:
     for env_id, entry in zoo.read_hyperparams().items():
         if env_id != "default":
+            assert ("env_wrapper" in entry) == (recommended_wrapper(env_id) is not None)
+            entry.pop("env_wrapper", None)  # the zoo puts it around by itself
             ours = load_hyperparams(env_id)
             assert entry.keys() == ours.keys()
             assert all(ours[name] == value for name, value in entry.items() if name != "option_class")
             assert "option_class" not in entry or ours["option_class"].__name__ == entry["option_class"]
+    assert zoo.hyperparams["AntMaze_UMaze-v5"]["env_wrapper"] == "sb3_skillgraph.envs.AntRecipe"
     assert zoo.hyperparams["default"] == {"n_timesteps": 100_000, "policy": "MultiInputPolicy"}
 
 

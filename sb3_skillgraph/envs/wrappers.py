@@ -82,6 +82,62 @@ def lies_down(quaternion: np.ndarray) -> bool:
     return 1.0 - 2.0 * (x * x + y * y) <= _UPRIGHT
 
 
+class AntRecipe(gym.Wrapper, gym.utils.RecordConstructorArgs):
+    """
+    gymnasium-robotics' ants as the recipe for ants wants them: with the torque and the control period of D4RL's ant.
+
+    An action is held for two steps of the environment, which become one of 0.1 s, at a fifth of the torque; contact forces
+    are left out of the observation; ``info["stuck"]`` tells when the ant lies on its back.
+
+    :param env: ``AntMaze_*`` of gymnasium-robotics
+    :raises ValueError: if it is no ant in a maze
+    """
+
+    option_view = "placed_body"
+    torque = 0.2
+    n_steps = 2
+    n_body = 27  # numbers of the observation that are positions and velocities; contact forces may follow
+
+    def __init__(self, env: gym.Env) -> None:
+        gym.utils.RecordConstructorArgs.__init__(self)
+        super().__init__(env)
+        space = env.observation_space
+        body = space["observation"] if isinstance(space, spaces.Dict) and "observation" in space.spaces else space
+        if not isinstance(space, spaces.Dict) or not isinstance(body, spaces.Box) or body.shape[0] < self.n_body:
+            raise ValueError(f"AntRecipe is for gymnasium-robotics' AntMaze_*, which observe a body, and this is {space}.")
+        low, high = body.low[: self.n_body], body.high[: self.n_body]
+        shorter = spaces.Box(low, high, dtype=body.dtype.type)
+        self.observation_space = spaces.Dict({**space.spaces, "observation": shorter})
+
+    def _seen(self, observation: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        return {**observation, "observation": observation["observation"][: self.n_body]}
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode.
+
+        :param seed: seeds the wrapped environment
+        :param options: those of the wrapped environment
+        :return: observation and info
+        """
+        observation, info = self.env.reset(seed=seed, options=options)
+        return self._seen(observation), info
+
+    def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Hold an action until the episode is over or the ant has fallen.
+
+        :param action: shape ``(8,)``
+        :return: last observation, sum of the rewards, terminated, truncated and the last info
+        """
+        total = 0.0
+        for _ in range(self.n_steps):
+            observation, reward, terminated, truncated, info = self.env.step(self.torque * action)
+            total += float(reward)
+            stuck = on_its_back(observation)
+            if terminated or truncated or stuck:
+                break
+        return self._seen(observation), total, terminated, truncated, {**info, "stuck": stuck}
+
+
 class FlattenGoals(gym.ObservationWrapper):
     """
     Makes one vector of goals that are nested dictionaries, such as those of gymnasium-robotics' FrankaKitchen.

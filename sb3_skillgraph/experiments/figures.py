@@ -4,7 +4,6 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-import gymnasium as gym
 import numpy as np
 from matplotlib.axes import Axes
 
@@ -16,6 +15,7 @@ from sb3_skillgraph.experiments.run_folder import DONE, STEPS, checkpoints, load
 from sb3_skillgraph.experiments.status import is_done
 from sb3_skillgraph.experiments.summary import estimate
 from sb3_skillgraph.experiments.testing import STRETCH
+from sb3_skillgraph.hyperparams import make_recommended
 from sb3_skillgraph.learning.dco import learn_fiedler
 from sb3_skillgraph.plotting import paper_figures as draw
 
@@ -75,11 +75,11 @@ def _name(spec: RunSpec) -> str:
 
 def _agent(spec: RunSpec, out: Path) -> SkillGraphAgent:
     saved = checkpoints(spec.folder(out))
-    return load_agent(saved[max(saved)], gym.make(spec.env_id, **spec.env_kwargs))
+    return load_agent(saved[max(saved)], make_recommended(spec.env_id, spec.env_kwargs))
 
 
 def _geometry(spec: RunSpec) -> MazeGeometry:
-    env = gym.make(spec.env_id, **spec.env_kwargs)
+    env = make_recommended(spec.env_id, spec.env_kwargs)
     geometry: MazeGeometry = env.get_wrapper_attr("geometry")
     env.close()
     return geometry
@@ -114,7 +114,7 @@ def exploration(specs: Sequence[RunSpec], out: Path) -> Axes:
     """Figure 4: where the agent has been, and where a random walk gets in the same steps."""
     spec = _finished(specs, out)[0]
     visits, geometry = _visits(_agent(spec, out)), _geometry(spec)
-    walked = random_walk(gym.make(spec.env_id, **spec.env_kwargs), spec.seed, len(visits))
+    walked = random_walk(make_recommended(spec.env_id, spec.env_kwargs), spec.seed, len(visits))
     panels = draw.new_panels(6, n_rows=2)
     for name, points, row in ((_name(spec), visits, panels[:3]), ("random walk", walked, panels[3:])):
         for axes, share in zip(row, (0.1, 0.4, 1.0), strict=True):

@@ -28,7 +28,7 @@ from sb3_skillgraph.baselines import (
 )
 from sb3_skillgraph.evaluation import Predictor
 from sb3_skillgraph.experiments.run_folder import AGENT, load_agent, save_agent, stops
-from sb3_skillgraph.hyperparams import check_hyperparams, did_you_mean, load_hyperparams
+from sb3_skillgraph.hyperparams import check_hyperparams, did_you_mean, load_hyperparams, make_recommended
 from sb3_skillgraph.options.learner import OptionDDPG, OptionTD3
 from sb3_skillgraph.plotting import snapshot
 
@@ -151,7 +151,7 @@ class SkillGraphLearner(Learner):
     resumable = True
 
     def __init__(self, env_id: str, env_kwargs: dict[str, Any], seed: int, arguments: dict[str, Any]) -> None:
-        self.env = gym.make(env_id, **env_kwargs)
+        self.env = make_recommended(env_id, env_kwargs)
         self.agent = SkillGraphAgent(env=self.env, seed=seed, **self.resolve(env_id, arguments))
 
     @classmethod
@@ -228,7 +228,7 @@ class _Checks(BaseCallback):
 def _ending_at_goals(env_id: str, env_kwargs: dict[str, Any]) -> gym.Env:
     """Make an environment whose episodes end at goals; other people's are taken as they come."""
     ours = {"terminate_on_success": True} if env_id.startswith("SkillGraph/") else {}
-    return gym.make(env_id, **{**ours, **env_kwargs})
+    return make_recommended(env_id, {**ours, **env_kwargs})
 
 
 class GoalConditionedLearner(Learner):
@@ -291,7 +291,7 @@ class RecipeLearner(Learner):
     """The skill graph's walker, learned by itself."""
 
     def __init__(self, env_id: str, env_kwargs: dict[str, Any], seed: int, arguments: dict[str, Any]) -> None:
-        env = NewGoals(gym.make(env_id, **env_kwargs), GOAL_STEPS)
+        env = NewGoals(make_recommended(env_id, env_kwargs), GOAL_STEPS)
         self.recipe = HindsightRecipe(env, seed=seed, **self.resolve(env_id, arguments))
         self.policy = self.recipe.policy
 
@@ -378,7 +378,7 @@ class RandomWalkLearner(Learner):
     """Learns nothing; the least to beat."""
 
     def __init__(self, env_id: str, env_kwargs: dict[str, Any], seed: int, arguments: dict[str, Any]) -> None:
-        env = gym.make(env_id, **env_kwargs)
+        env = make_recommended(env_id, env_kwargs)
         assert isinstance(env.action_space, spaces.Box)
         self.policy = RandomWalk(env.action_space, seed, **arguments)
         env.close()

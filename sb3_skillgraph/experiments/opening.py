@@ -10,7 +10,7 @@ from sb3_skillgraph.agent import SkillGraphAgent
 from sb3_skillgraph.envs import find
 from sb3_skillgraph.experiments.console import UserError, assignment, for_people
 from sb3_skillgraph.experiments.run_folder import AGENT, CONFIG, run_config
-from sb3_skillgraph.hyperparams import did_you_mean
+from sb3_skillgraph.hyperparams import did_you_mean, make_recommended
 
 
 def add_command(commands: Any, name: str, run: Any, summary: str, detail: str) -> argparse.ArgumentParser:
@@ -112,7 +112,7 @@ def make_env(env_id: str, env_kwargs: dict[str, Any]) -> gym.Env:
     """
     check_env_id(env_id)
     with for_people():
-        return gym.make(env_id, **env_kwargs)
+        return make_recommended(env_id, env_kwargs)
 
 
 def load_agent(path: Path, env: gym.Env) -> SkillGraphAgent:

@@ -8,6 +8,7 @@ import numpy as np
 from sb3_skillgraph.evaluation import PairResult, PairsResult, Predictor, evaluate_pairs, run_pair
 from sb3_skillgraph.experiments.learners import Learner
 from sb3_skillgraph.experiments.plan import RunSpec
+from sb3_skillgraph.hyperparams import make_recommended
 
 STRETCH = 1_000  # environment steps between tests at test time: an episode
 
@@ -56,7 +57,7 @@ def test_policy(policy: Predictor, spec: RunSpec, n_steps: int) -> Test:
     :param n_steps: environment steps done; at the end more is tested
     """
     n_pairs = spec.final_pairs if n_steps >= spec.steps else spec.pairs
-    env = gym.make(spec.env_id, **{**spec.env_kwargs, **spec.test_kwargs})
+    env = make_recommended(spec.env_id, {**spec.env_kwargs, **spec.test_kwargs})
     try:
         pairs = evaluate_pairs(policy, env, n_pairs=n_pairs, seed=spec.seed + 1000)
         return Test(pairs, _run_tasks(policy, env, spec) if spec.task_episodes else [])
@@ -88,7 +89,7 @@ def learn_at_test_time(learner: Learner, spec: RunSpec, result: PairsResult) -> 
     env_kwargs = {"terminate_on_success": True, **spec.env_kwargs}
     curves = []
     for pair in result.pairs[: spec.test_pairs]:
-        pinned, test = (gym.make(spec.env_id, **env_kwargs) for _ in range(2))
+        pinned, test = (make_recommended(spec.env_id, env_kwargs) for _ in range(2))
         test.reset(seed=spec.seed)
         practice = Pinned(pinned, pair.start, pair.goal)
         twins = learner.practise(practice, pair.start, pair.goal, [STRETCH] * spec.test_stretches)

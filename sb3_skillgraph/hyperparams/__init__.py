@@ -1,11 +1,14 @@
 """Hyperparameters per environment, read from YAML beside this file (the layout of SB3's zoo)."""
 
 import difflib
+import fnmatch
+import importlib
 import inspect
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import yaml
 
 from sb3_skillgraph.agent import SkillGraphAgent
@@ -13,6 +16,7 @@ from sb3_skillgraph.arguments import OPTION_CLASSES
 from sb3_skillgraph.rules import PAPER
 
 FILE = Path(__file__).parent / "skillgraph.yml"
+WRAPPER = "env_wrapper"
 
 # `n_timesteps` is for learn(); the others of these are given by who makes the agent.
 _PARAMETERS = inspect.signature(SkillGraphAgent.__init__).parameters
@@ -38,12 +42,43 @@ def load_hyperparams(env_id: str, path: Path = FILE, *, required: bool = False) 
     if required and env_id not in document:
         raise ValueError(f"{path.name} has no entry {env_id!r}{did_you_mean(env_id, document)}.")
     hyperparams: dict[str, Any] = {}
-    for entry in ("defaults", env_id):
+    for entry in ("defaults", _entry_of(env_id, document)):
         values = document.get(entry) or {}
         if not isinstance(values, dict):
             raise ValueError(f"{path.name}, entry {entry!r}: a mapping of argument names to values is wanted.")
-        hyperparams.update(check_hyperparams(values, f"{path.name}, entry {entry!r}"))
+        settings = {name: value for name, value in values.items() if name != WRAPPER}
+        hyperparams.update(check_hyperparams(settings, f"{path.name}, entry {entry!r}"))
     return hyperparams
+
+
+def _entry_of(env_id: str, entries: Iterable[str]) -> str:
+    """Return the entry that is for an environment: its own, else the first whose star stands for the rest of its name."""
+    fitting = (entry for entry in entries if fnmatch.fnmatchcase(env_id, str(entry)))
+    return env_id if env_id in entries else next(fitting, env_id)
+
+
+def recommended_wrapper(env_id: str) -> Callable[[gym.Env], gym.Env] | None:
+    """Return the wrapper that is recommended for an environment; None for most.
+
+    :param env_id: id of the environment
+    """
+    document = yaml.safe_load(FILE.read_text(encoding="utf-8"))
+    name = document.get(_entry_of(env_id, document), {}).get(WRAPPER)
+    if name is None:
+        return None
+    package, _, wrapper = name.rpartition(".")
+    found: Callable[[gym.Env], gym.Env] = getattr(importlib.import_module(package), wrapper)
+    return found
+
+
+def make_recommended(env_id: str, env_kwargs: dict[str, Any]) -> gym.Env:
+    """Make an environment, with the wrapper that is recommended for it.
+
+    :param env_id: its id
+    :param env_kwargs: its keyword arguments
+    """
+    env, wrapper = gym.make(env_id, **env_kwargs), recommended_wrapper(env_id)
+    return env if wrapper is None else wrapper(env)
 
 
 def check_hyperparams(values: dict[str, Any], origin: str) -> dict[str, Any]:

@@ -1,0 +1,328 @@
+"""Write ``docs/results.md`` and the README's table from the tables under ``benchmarks/results/``: no number is typed.
+
+python -m benchmarks.report
+"""
+
+import json
+import math
+import pathlib
+import re
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from benchmarks.collect import RESULTS, Row, names, read
+
+ROOT = pathlib.Path(__file__).parents[1]
+PAGE, README = ROOT / "docs" / "results.md", ROOT / "README.md"
+BEGIN, END = "<!-- results: python -m benchmarks.report -->", "<!-- end of results -->"
+#: Plans in a bin of promises from which on it is shown.
+ENOUGH_PLANS = 100
+
+TASKS = {
+    "umaze": "Point maze, UMaze",
+    "medium": "Point maze, Medium",
+    "hard": "Point maze, Hard",
+    "car-medium": "Car, Medium",
+    "key-door": "Key and door",
+    "fetch-reach": "`FetchReach-v4`",
+    "panda-reach": "`PandaReach-v3`",
+    "point-large": "`PointMaze_Large-v3`",
+    "fetch-push": "`FetchPush-v4`",
+    "ant-umaze-v5": "`AntMaze_UMaze-v5`, recipe's wrappers",
+    "parking": "`parking-v0`",
+    "ant-umaze": "Ant, U-maze",
+    "ant-reacher": "Ant, open floor",
+    "ant-medium": "Ant, Medium",
+    "ant-large": "Ant, Large",
+}
+OGBENCH = {
+    "medium": "`pointmaze-medium-v0`",
+    "large": "`pointmaze-large-v0`",
+    "giant": "`pointmaze-giant-v0`",
+    "teleport": "`pointmaze-teleport-v0`",
+    "giant-100": "giant, episodes of 100 steps from anywhere",
+    "giant-200": "giant, episodes of 200 steps from anywhere",
+}
+#: Success of the best published method on OGBench's tasks, learned offline from its data (percent, OGBench's paper and later).
+PUBLISHED = {"medium": 0.91, "large": 0.88, "giant": 0.92, "teleport": 0.57}
+
+
+def number(value: float, digits: int = 2) -> str:
+    """Return a number as text, a dash where there is none."""
+    return "-" if value == "" or math.isnan(value) else f"{value:.{digits}f}"
+
+
+def rate(row: Row) -> str:
+    """Return a mean over seeds with its interval."""
+    if math.isnan(row["low"]):
+        return f"{row['mean']:.2f} (one seed)"
+    return f"{row['mean']:.3f} ({row['low']:.2f} to {row['high']:.2f})"
+
+
+def verdict(row: Row) -> str:
+    """Tell whether a method differs from the first of its plan."""
+    if math.isnan(row["difference"]):
+        return ""
+    if math.isnan(row["difference_low"]):
+        return f"{row['difference']:+.2f}"
+    told = "told apart" if row["difference_low"] > 0 or row["difference_high"] < 0 else "not told apart"
+    return f"{row['difference']:+.2f} ({row['difference_low']:+.2f} to {row['difference_high']:+.2f}), {told}"
+
+
+def table(head: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
+    """Return a table in Markdown."""
+    return "\n".join(f"| {' | '.join(line)} |" for line in (head, ["---"] * len(head), *lines))
+
+
+def summary(plan: str) -> list[Row]:
+    """Read a plan's summary."""
+    return read(RESULTS / plan / "summary.csv")
+
+
+def command(plan: str) -> str:
+    """Return the commands that made a folder of results."""
+    return "\n".join(["```", (RESULTS / plan / "command.txt").read_text().strip(), "```"])
+
+
+def methods(plan: str) -> str:
+    """Return a table of all methods of a plan on all its tasks."""
+    head = ("Task", "Steps", "Method", "Success", "Difference to `skill-graph`", "Steps to goals", "Over ours", "Seeds")
+    lines = [
+        (
+            TASKS[row["environment"]],
+            str(row["steps"]),
+            f"`{row['method']}`",
+            rate(row),
+            verdict(row),
+            number(row["steps_to_goals"], 0),
+            number(row["steps_over_first"]),
+            str(row["seeds"]),
+        )
+        for row in summary(plan)
+    ]
+    return table(head, lines)
+
+
+def curves(plan: str, method: str, environments: Sequence[str]) -> str:
+    """Return how a method's success grows with the steps, one line for each task."""
+    rows = [row for row in read(RESULTS / plan / "curves.csv") if row["method"] == method]
+    lines = []
+    for environment in environments:
+        here = [row for row in rows if row["environment"] == environment]
+        by_steps = {
+            steps: [r["success_rate"] for r in here if r["steps"] == steps] for steps in sorted({r["steps"] for r in here})
+        }
+        text = ", ".join(f"{np.mean(rates):.2f} ({steps})" for steps, rates in by_steps.items())
+        lines.append(f"* {TASKS[environment]}: {text}.")
+    return "\n".join(lines)
+
+
+def ogbench() -> str:
+    """Return the table of OGBench's mazes."""
+    rows = summary("ogbench")
+    head = ("Maze", "Steps", "Method", "Official tasks", "Best published", "Random pairs", "Times the shortest", "Seeds")
+    lines = [
+        (
+            OGBENCH[row["environment"]],
+            str(row["steps"]),
+            f"`{row['method']}`",
+            number(row["task_success_rate"], 3),
+            number(PUBLISHED.get(row["environment"], math.nan)),
+            rate(row),
+            number(row["times_shortest"]),
+            str(row["seeds"]),
+        )
+        for row in rows
+    ]
+    return table(head, lines)
+
+
+def ants() -> str:
+    """Return the table of the ants, seed by seed."""
+    rows = read(RESULTS / "ants" / "curves.csv")
+    lines = []
+    for environment in dict.fromkeys(row["environment"] for row in rows):
+        for steps in sorted({row["steps"] for row in rows if row["environment"] == environment}):
+            here = [row for row in rows if (row["environment"], row["steps"]) == (environment, steps)]
+            seeds = ", ".join(f"{row['success_rate']:.2f}" for row in here)
+            falls = ", ".join(str(row["falls"]) for row in here)
+            mean = f"{np.mean([row['success_rate'] for row in here]):.3f} ({seeds})"
+            to_goals = number(float(np.mean([row["steps_to_goals"] for row in here])), 0)
+            lines.append((TASKS[environment], str(steps), mean, to_goals, falls))
+    return table(("Task", "Steps", "Success", "Steps to goals", "Falls"), lines)
+
+
+def straight_on(plan: str) -> str:
+    """Return, task by task, what the same walker does without its graph."""
+    rows = [row for row in summary(plan) if row["method"] == "straight-on"]
+    return ", ".join(f"{row['mean']:.2f} ({TASKS[row['environment']]})" for row in rows)
+
+
+def promises(plan: str, environment: str, method: str = "skill-graph") -> str:
+    """Return what plans promised beside what happened, all seeds and tests together."""
+    mine = [
+        row for row in read(RESULTS / plan / "promises.csv") if (row["environment"], row["method"]) == (environment, method)
+    ]
+    bins = []
+    for low in sorted({row["low"] for row in mine}):
+        here = [row for row in mine if row["low"] == low]
+        n_plans = [row["n_plans"] for row in here]
+        if sum(n_plans) >= ENOUGH_PLANS:
+            promised, observed = (
+                np.average([row[name] for row in here], weights=n_plans) for name in ("promised", "observed")
+            )
+            bins.append(f"{promised:.2f} promised, {observed:.2f} happened ({sum(n_plans)} plans)")
+    tests = {(row["seed"], row["steps"]): row["brier"] for row in mine}
+    sizes = {key: sum(row["n_plans"] for row in mine if (row["seed"], row["steps"]) == key) for key in tests}
+    brier = np.average(list(tests.values()), weights=list(sizes.values()))
+    happened = np.average([row["observed"] for row in mine], weights=[row["n_plans"] for row in mine])
+    return f"{'; '.join(bins)}; Brier score {brier:.3f}, of always saying the mean {happened * (1 - happened):.3f}"
+
+
+def kept(environment: str, begin: int) -> str:
+    """Tell the least success of all tests from some number of steps on."""
+    rows = [
+        row for row in read(RESULTS / "kept" / "curves.csv") if row["environment"] == environment and row["steps"] >= begin
+    ]
+    means = [np.mean([r["success_rate"] for r in rows if r["steps"] == steps]) for steps in {row["steps"] for row in rows}]
+    end, n_seeds = max(row["steps"] for row in rows), len({row["seed"] for row in rows})
+    worst = min(row["success_rate"] for row in rows)
+    lowest = f"the mean over {n_seeds} seeds is never below {min(means):.3f}, and no seed below {worst:.2f}"
+    return f"from {begin} to {end} steps {lowest}"
+
+
+def few_shot() -> str:
+    """Return success after so many further steps."""
+    rows = read(RESULTS / "few_shot" / "runs.csv")
+    extra = sorted({row["extra_steps"] for row in rows})
+    means = [f"{np.mean([r['success_rate'] for r in rows if r['extra_steps'] == n]):.2f} ({n})" for n in extra]
+    lost = np.mean([row["old_pairs_before"] - row["old_pairs_after"] for row in rows])
+    return f"{', '.join(means)}; of the pairs that were reached before {lost:.3f} are lost"
+
+
+def document(name: str) -> Any:
+    """Read a result that is no table."""
+    return json.loads((RESULTS / name).read_text())
+
+
+def older() -> str:
+    """Return what steps to goals are of those of version 0.1.0."""
+    parts = [
+        f"{each['environment']} after {each['training_steps']} steps {each['ratio']:.2f} times ({each['pairs']} pairs)"
+        for each in document("steps_against_0.1.0.json")["comparisons"]
+    ]
+    return "; ".join(parts)
+
+
+def wall_clock() -> str:
+    """Return the seconds to success."""
+    tasks = {name: runs for name, runs in document("wall_clock.json").items() if isinstance(runs, list)}
+    parts = []
+    for name, runs in tasks.items():
+        seconds = ", ".join(f"{run['seconds']:.0f}" for run in runs)
+        parts.append(f"{name} {seconds} s ({', '.join(number(run['her']) for run in runs)})")
+    return "; ".join(parts)
+
+
+def scaling() -> str:
+    """Return what grows."""
+    result = document("scaling.json")
+
+    def each(rows: list[Row], name: str, factor: float = 1.0, digits: int = 2) -> str:
+        return ", ".join(f"{factor * row[name]:.{digits}f}" for row in rows)
+
+    visited, events = result["visited"], result["events"]
+    return (
+        f"with {each(visited, 'visited', 1, 0)} stored transitions a learning step on the toy takes "
+        f"{each(visited, 'learning_step_ms')} ms, a `predict` while an option runs "
+        f"{each(visited, 'predict_ms', 1000, 0)} µs, a decision {each(visited, 'decision_ms')} ms; "
+        f"with {each(events, 'events', 1, 0)} events of 32 edges each a decision takes "
+        f"{each(events, 'decision_ms', 1, 1)} ms, the mask of `OptionsEnv` with an action for each "
+        f"{each(events, 'mask_ms', 1, 1)} ms"
+    )
+
+
+def throughput() -> str:
+    """Return the milliseconds of a step of learning."""
+    cases = [case for case in document("throughput.json")["cases"] if case["net_arch"] == [128, 128]]
+    parts = [
+        f"{case['ours']['total']:.1f} ms on the {case['env']}, SB3's DDPG {case['sb3']['total']:.1f} ms" for case in cases
+    ]
+    return "; ".join(parts)
+
+
+def soak() -> str:
+    """Return how a million steps went."""
+    result = document("soak.json")
+    return (
+        f"the last tenth goes at {result['last_over_second']:.2f} of the pace of the second, and the process holds "
+        f"{result['memory_since_full']:.3f} times the memory that it held when its replay buffer became full"
+    )
+
+
+def readme_table() -> str:
+    """Return the README's table."""
+    lines = []
+    for plan, shown in (
+        ("point_mazes", ("medium", "hard")),
+        ("kept", ("key-door",)),
+        ("foreign", ("fetch-reach", "panda-reach", "point-large")),
+        ("ants", ("ant-umaze", "ant-reacher", "ant-medium")),
+    ):
+        rows = {(row["environment"], row["method"]): row for row in summary(plan)}
+        for environment in shown:
+            ours = rows[environment, "skill-graph"]
+            others = [rows.get((environment, method)) for method in ("straight-on", "ddpg-her")]
+            beside = [f"{row['mean']:.2f}" if row else "" for row in others]
+            lines.append((TASKS[environment], str(ours["steps"]), rate(ours), *beside))
+    for row in summary("ogbench"):
+        if row["method"] == "skill-graph" and row["environment"] in ("giant", "teleport"):
+            rows = [r for r in summary("ogbench") if r["environment"] == row["environment"]]
+            rates = {r["method"]: number(r["task_success_rate"]) for r in rows}
+            official = f"{row['task_success_rate']:.3f}; best published, offline: {PUBLISHED[row['environment']]}"
+            beside = [rates.get(method, "") for method in ("straight-on", "ddpg-her")]
+            lines.append((f"{OGBENCH[row['environment']]}, official tasks", str(row["steps"]), official, *beside))
+    return table(("Task", "Steps of training", "Success", "Straight on", "DDPG + HER"), lines)
+
+
+def page() -> str:
+    """Return the page."""
+    template = (ROOT / "benchmarks" / "results.template.md").read_text()
+    known: dict[str, Callable[..., str]] = {
+        function.__name__: function
+        for function in (ants, command, curves_of, few_shot, kept, methods, ogbench, older, promises, scaling, seeds, soak)
+    }
+    known |= {function.__name__: function for function in (straight_on, throughput, wall_clock)}
+
+    def fill(match: re.Match[str]) -> str:
+        name, *arguments = match[1].split()
+        return known[name](*(int(word) if word.isdigit() else word for word in arguments))
+
+    return re.sub(r"\{\{ ([^}]+) \}\}", fill, template)
+
+
+def curves_of(plan: str, method: str) -> str:
+    """Return the learning curves of a method of a plan, on all its tasks."""
+    rows = [row for row in summary(plan) if row["method"] == method]
+    return curves(plan, method, [row["environment"] for row in rows])
+
+
+def seeds(plan: str) -> str:
+    """Tell how many seeds each method of a plan has."""
+    rows = summary(plan)
+    counts = {name: sorted({row["seeds"] for row in rows if row["method"] == name}) for name in names(rows)}
+    return ", ".join(f"`{name}` {' or '.join(map(str, count))}" for name, count in counts.items())
+
+
+def main() -> None:
+    """Write both."""
+    PAGE.write_text(page())
+    text = README.read_text()
+    begin, end = text.index(BEGIN) + len(BEGIN), text.index(END)
+    README.write_text(f"{text[:begin]}\n{readme_table()}\n{text[end:]}")
+
+
+if __name__ == "__main__":
+    main()
