@@ -531,3 +531,45 @@ def test_compare_and_status_on_the_command_line(runs: tuple[Path, Path], capsys:
     assert "1/1" in capsys.readouterr().out
     assert main(["status", "nowhere.yml", "--out", str(runs[1])]) == 2
     assert "there is no plan nowhere.yml" in capsys.readouterr().err
+
+
+# -- what a plan tests ------------------------------------------------------------------------------------------------
+
+
+def test_other_ways_to_act_are_tested_at_the_end_on_the_same_pairs(tmp_path: Path) -> None:
+    rivals = {
+        "straight": {"algorithm": "straight_on"},
+        "search": {"algorithm": "replay_search", "arguments": {"n_states": 50}},
+    }
+    this = spec(steps=400, also=rivals)
+    assert run(this, tmp_path) == "done", (this.folder(tmp_path) / "error.txt").read_text()
+    done = json.loads((this.folder(tmp_path) / "done.json").read_text())
+    assert list(done["also"]) == ["straight", "search"]
+    for test in done["also"].values():
+        assert [pair["goal"] for pair in test["pairs"]] == [pair["goal"] for pair in done["pairs"]]
+        assert "promised" not in test["pairs"][0] and 0.0 < done["pairs"][0]["promised"] <= 1.0
+
+
+def test_every_test_is_kept_pair_by_pair_under_its_own_conditions(tmp_path: Path) -> None:
+    this = spec(steps=400, test_kwargs={"max_steps": 30})
+    assert run(this, tmp_path) == "done"
+    folder = this.folder(tmp_path)
+    for row, n_pairs in zip(read_progress(folder), (3, 4), strict=True):
+        test = json.loads((folder / f"test_{row['time/total_timesteps']}.json").read_text())
+        assert len(test["pairs"]) == n_pairs and max(pair["steps"] for pair in test["pairs"]) <= 30
+        assert test["success_rate"] == float(row["eval/success_rate"])
+
+
+@pytest.mark.mujoco
+def test_the_tasks_of_an_environment_are_done(tmp_path: Path) -> None:
+    pytest.importorskip("ogbench")
+    giant = {"env_id": "SkillGraph/OGBenchPointMedium-v0", "env_kwargs": {"random_start": True, "max_steps": 20}}
+    this = RunSpec(
+        "walk", "giant", 0, "random_walk", steps=100, check_every=100, pairs=2, final_pairs=2, task_episodes=2, **giant
+    )
+    assert run(this, tmp_path) == "done", (this.folder(tmp_path) / "error.txt").read_text()
+    done = json.loads((this.folder(tmp_path) / "done.json").read_text())
+    assert [len(task) for task in done["tasks"]] == [2] * 5
+    assert "eval/task_success_rate" in read_progress(this.folder(tmp_path))[0]
+    starts = np.array([episode["start"] for episode in done["tasks"][0]])
+    assert (starts[0] != starts[1]).any() and np.ptp(starts, axis=0).max() <= 2.0

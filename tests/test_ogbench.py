@@ -259,3 +259,13 @@ def test_an_agent_learns_there_and_resumes(tmp_path: Path) -> None:
     assert differences(whole.graph.get_state(), resumed.graph.get_state()) == []
     assert differences(whole.parts.store.get_state(), resumed.parts.store.get_state()) == []
     assert len(whole.events) > 3
+
+
+def test_episodes_begin_anywhere_if_asked_to() -> None:
+    env = make(random_start=True)
+    starts = np.array([env.reset(seed=0 if i == 0 else None)[0]["achieved_goal"] for i in range(20)])
+    assert env.geometry.is_free(starts, 0.5).all()
+    assert np.ptp(starts, axis=0).min() > 10.0
+    chosen = env.reset(options={"start": starts[3]})[0]["achieved_goal"]
+    np.testing.assert_allclose(chosen, starts[3])
+    env.close()

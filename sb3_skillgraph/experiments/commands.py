@@ -31,8 +31,8 @@ def add_compare(commands: Any) -> None:
         "compare",
         _compare,
         "Run methods on environments with several seeds; what is done is skipped, what was killed goes on.",
-        "PLAN names methods, environments and seeds (benchmarks/compare.yml is one). Several of these may work in one OUT.\n\n"
-        "example:\n  sb3-skillgraph compare benchmarks/compare.yml --out runs/compare --jobs 2",
+        "PLAN names methods, environments and seeds (benchmarks/point_mazes.yml is one). Several may work in one OUT.\n\n"
+        "example:\n  sb3-skillgraph compare benchmarks/point_mazes.yml --out runs/point_mazes --jobs 2",
     )
     command.add_argument("--jobs", type=positive, default=1, help="runs at a time (default: 1)")
     command.add_argument(
@@ -50,7 +50,7 @@ def add_status(commands: Any) -> None:
         "status",
         _status,
         "Show how the runs of a plan stand, and how long they will take.",
-        "example:\n  sb3-skillgraph status benchmarks/compare.yml --out runs/compare",
+        "example:\n  sb3-skillgraph status benchmarks/point_mazes.yml --out runs/point_mazes",
     )
 
 
@@ -64,7 +64,7 @@ def add_figure(commands: Any) -> None:
         help="Redraw a figure of the paper from the runs of a plan.",
         description="3 frontier and Fiedler values; 4 exploration; 5 learning curves; 6 growth of the graph; "
         "9 where deep covering options fail.\n\n"
-        "example:\n  sb3-skillgraph figure 5 benchmarks/compare.yml --out runs/compare --to figure_5.png",
+        "example:\n  sb3-skillgraph figure 5 benchmarks/point_mazes.yml --out runs/point_mazes --to figure_5.png",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     command.set_defaults(run=_figure)
