@@ -57,8 +57,8 @@ class ReplaySearch:
         self.places = store.column("achieved_goal", rows)
         between = np.stack([self.steps(*here, self.places) for here in zip(self.observations, self.places, strict=True)])
         np.fill_diagonal(between, np.inf)
-        self._edges = np.argwhere(between < agent.graph.walk_steps)
-        self._weights = between[tuple(self._edges.T)]
+        # Searches go back from the goal: row j holds the states from which one walks to state j.
+        self._arrivals = csr_array(np.where(agent.graph.walk_steps > between.T, np.maximum(between.T, LEAST), 0.0))
 
     def steps(self, observation: np.ndarray, place: np.ndarray, goal: np.ndarray) -> np.ndarray:
         """Return how many steps the walker's critic expects a way to take, shape ``(n,)``.
@@ -89,30 +89,39 @@ class ReplaySearch:
         :param goal: shape ``(goal_dim,)``
         :param barred: legs not to take, shape ``(m, 2)``
         """
-        start, end = self.n_states, self.n_states + 1
+        end, far = self.n_states + 1, self.agent.graph.walk_steps
         away = self.steps(observation, place, np.vstack([self.places, goal]))
-        home = self.steps(self.observations, self.places, goal)
-        leaving = np.flatnonzero(away < self.agent.graph.walk_steps)
-        arriving = np.flatnonzero(home < self.agent.graph.walk_steps)
-        edges = np.vstack(
-            [
-                self._edges,
-                np.stack([np.full(len(leaving), start), np.where(leaving == start, end, leaving)], axis=1),
-                np.stack([arriving, np.full(len(arriving), end)], axis=1),
-            ]
-        )
-        weights = np.concatenate([self._weights, away[leaving], home[arriving]])
-        if barred is not None and len(barred):
-            kept = ~(edges[:, None] == barred).all(axis=2).any(axis=1)
-            edges, weights = edges[kept], weights[kept]
-        graph = csr_array((np.maximum(weights, LEAST), tuple(edges.T)), shape=(end + 1, end + 1))
-        _, before = dijkstra(graph, indices=start, return_predecessors=True)
-        if before[end] < 0:
+        home = np.maximum(self.steps(self.observations, self.places, goal), LEAST)
+        away[away >= far], home[home >= far] = np.inf, np.inf
+        arrivals = self._arrivals
+        for begin, until in [] if barred is None else barred.tolist():
+            if begin == self.n_states:  # a leg from where it was planned
+                away[min(until, self.n_states)] = np.inf
+            elif until == end:
+                home[begin] = np.inf
+            else:
+                arrivals = arrivals.copy() if arrivals is self._arrivals else arrivals
+                arrivals[until, begin] = np.inf
+        cost, following = self._back_from_goal(arrivals, home)
+        # Straight on is a way, too.
+        total = away + np.append(cost, 0.0)
+        way = [int(total.argmin())]
+        if total[way[0]] == np.inf:
             return None
-        way = [end]
-        while way[-1] != start:
-            way.append(int(before[way[-1]]))
-        return way[-2:0:-1]
+        while way[-1] < self.n_states:
+            way.append(int(following[way[-1]]))
+        return way[:-1]
+
+    def _back_from_goal(self, arrivals: csr_array, home: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return of every state the steps to the goal, and the state that comes next, ``n_states`` for the goal."""
+        last = np.flatnonzero(home < np.inf)
+        pointers = np.append(arrivals.indptr, arrivals.indptr[-1] + len(last))
+        columns, weights = np.append(arrivals.indices, last), np.append(arrivals.data, home[last])
+        n = self.n_states + 1
+        cost, following = dijkstra(
+            csr_array((weights, columns, pointers), shape=(n, n)), indices=n - 1, return_predecessors=True
+        )
+        return cost[:-1], following[:-1]
 
     def predict(
         self,
