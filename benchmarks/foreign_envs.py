@@ -28,7 +28,7 @@ class Parking(gym.Wrapper):
 
 def make_parking(**kwargs: Any) -> gym.Env:
     """Make highway-env's parking lot."""
-    import highway_env  # noqa: F401 - registers it
+    import highway_env  # type: ignore[import-untyped, import-not-found, unused-ignore]  # noqa: F401
 
     env = gym.make("parking-v0", **kwargs)
     config = env.get_wrapper_attr("config")

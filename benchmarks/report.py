@@ -277,13 +277,13 @@ def readme_table() -> str:
             others = [rows.get((environment, method)) for method in ("straight-on", "ddpg-her")]
             beside = [f"{row['mean']:.2f}" if row else "" for row in others]
             lines.append((TASKS[environment], str(ours["steps"]), rate(ours), *beside))
-    for row in summary("ogbench"):
-        if row["method"] == "skill-graph" and row["environment"] in ("giant", "teleport"):
-            rows = [r for r in summary("ogbench") if r["environment"] == row["environment"]]
-            rates = {r["method"]: number(r["task_success_rate"]) for r in rows}
-            official = f"{row['task_success_rate']:.3f}; best published, offline: {PUBLISHED[row['environment']]}"
-            beside = [rates.get(method, "") for method in ("straight-on", "ddpg-her")]
-            lines.append((f"{OGBENCH[row['environment']]}, official tasks", str(row["steps"]), official, *beside))
+    official = {(row["environment"], row["method"]): row for row in summary("ogbench")}
+    for environment in ("giant", "teleport"):
+        ours = official[environment, "skill-graph"]
+        others = [official.get((environment, method)) for method in ("straight-on", "ddpg-her")]
+        beside = [number(row["task_success_rate"]) if row else "" for row in others]
+        success = f"{ours['task_success_rate']:.3f}; best published, offline: {PUBLISHED[environment]}"
+        lines.append((f"{OGBENCH[environment]}, official tasks", str(ours["steps"]), success, *beside))
     return table(("Task", "Steps of training", "Success", "Straight on", "DDPG + HER"), lines)
 
 

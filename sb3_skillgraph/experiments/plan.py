@@ -10,7 +10,8 @@ import gymnasium as gym
 import yaml
 
 from sb3_skillgraph.envs import find
-from sb3_skillgraph.experiments.learners import ALGORITHMS, RIVALS, check_names
+from sb3_skillgraph.experiments.learner import check_names
+from sb3_skillgraph.experiments.learners import ALGORITHMS, RIVALS
 from sb3_skillgraph.hyperparams import did_you_mean
 
 _COMMON = ("check_every", "pairs", "final_pairs", "task_episodes", "test_pairs", "test_stretches")

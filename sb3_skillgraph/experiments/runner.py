@@ -17,7 +17,8 @@ from filelock import Timeout
 from joblib import Parallel, delayed, parallel_config
 
 from sb3_skillgraph.experiments.console import versions
-from sb3_skillgraph.experiments.learners import ALGORITHMS, Learner
+from sb3_skillgraph.experiments.learner import Learner
+from sb3_skillgraph.experiments.learners import ALGORITHMS
 from sb3_skillgraph.experiments.plan import RunSpec
 from sb3_skillgraph.experiments.run_folder import (
     CONFIG,

@@ -6,7 +6,7 @@ import gymnasium as gym
 import numpy as np
 
 from sb3_skillgraph.evaluation import PairResult, PairsResult, Predictor, evaluate_pairs, run_pair
-from sb3_skillgraph.experiments.learners import Learner
+from sb3_skillgraph.experiments.learner import Learner
 from sb3_skillgraph.experiments.plan import RunSpec
 from sb3_skillgraph.hyperparams import make_recommended
 
