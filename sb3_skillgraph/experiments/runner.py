@@ -159,10 +159,7 @@ class _Run:
         document = {
             **test.as_plain(),
             "seconds": round(self.seconds, 1),
-            "also": {
-                name: test_policy(self.learner.rival(**rival), spec, spec.steps).as_plain()
-                for name, rival in spec.also.items()
-            },
+            "also": {name: self._test_rival(rival) for name, rival in spec.also.items()},
             "test_time": learn_at_test_time(self.learner, spec, test.pairs),
             **self.learner.summary(),
         }
