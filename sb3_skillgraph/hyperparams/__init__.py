@@ -63,7 +63,7 @@ def recommended_wrapper(env_id: str) -> Callable[[gym.Env], gym.Env] | None:
     :param env_id: id of the environment
     """
     document = yaml.safe_load(FILE.read_text(encoding="utf-8"))
-    name = document.get(_entry_of(env_id, document), {}).get(WRAPPER)
+    name = (document.get(_entry_of(env_id, document)) or {}).get(WRAPPER)
     if name is None:
         return None
     package, _, wrapper = name.rpartition(".")
