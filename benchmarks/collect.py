@@ -176,7 +176,7 @@ def summarise(runs: list[Row], order: list[str], first: str) -> list[Row]:
             difference = interval(shared, (-1.0, 1.0)) if shared and method != first else (math.nan,) * 3
             row |= dict(zip(("difference", "difference_low", "difference_high"), difference, strict=True))
             rows.append(row)
-    return sorted(rows, key=lambda row: (order.index(row["environment"]), -row["mean"]))
+    return sorted(rows, key=lambda row: (order.index(row["environment"]), -row["mean"], row["method"] != first))
 
 
 def names(runs: list[Row]) -> list[str]:
