@@ -31,7 +31,6 @@ TASKS = {
     "point-large": "`PointMaze_Large-v3`",
     "fetch-push": "`FetchPush-v4`",
     "ant-umaze-v5": "`AntMaze_UMaze-v5`, recipe's wrappers",
-    "parking": "`parking-v0`",
     "ant-umaze": "Ant, U-maze",
     "ant-reacher": "Ant, open floor",
     "ant-medium": "Ant, Medium",
