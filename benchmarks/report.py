@@ -262,6 +262,13 @@ def soak() -> str:
     )
 
 
+def aside(row: Row | None, name: str) -> str:
+    """Return what another method came to, where it was run; a single seed is told."""
+    if row is None:
+        return ""
+    return f"{row[name]:.2f}" + " (one seed)" * (row["seeds"] == 1)
+
+
 def readme_table() -> str:
     """Return the README's table."""
     lines = []
@@ -275,13 +282,13 @@ def readme_table() -> str:
         for environment in shown:
             ours = rows[environment, "skill-graph"]
             others = [rows.get((environment, method)) for method in ("straight-on", "ddpg-her")]
-            beside = [f"{row['mean']:.2f}" if row else "" for row in others]
+            beside = [aside(row, "mean") for row in others]
             lines.append((TASKS[environment], str(ours["steps"]), rate(ours), *beside))
     official = {(row["environment"], row["method"]): row for row in summary("ogbench")}
     for environment in ("giant", "teleport"):
         ours = official[environment, "skill-graph"]
         others = [official.get((environment, method)) for method in ("straight-on", "ddpg-her")]
-        beside = [number(row["task_success_rate"]) if row else "" for row in others]
+        beside = [aside(row, "task_success_rate") for row in others]
         success = f"{ours['task_success_rate']:.3f}; best published, offline: {PUBLISHED[environment]}"
         lines.append((f"{OGBENCH[environment]}, official tasks", str(ours["steps"]), success, *beside))
     return table(("Task", "Steps of training", "Success", "Straight on", "DDPG + HER"), lines)
