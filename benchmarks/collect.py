@@ -48,12 +48,13 @@ def described(test: dict[str, Any], ours: dict[str, Any], shortest: Shortest | N
     pairs = test["pairs"]
     reached = [pair for pair in pairs if pair["success"]]
     both = [(a["steps"], b["steps"]) for a, b in zip(pairs, ours["pairs"], strict=False) if a["success"] and b["success"]]
+    of_first = sum(steps for _, steps in both)
     row: Row = {
         "pairs": len(pairs),
         "success_rate": test["success_rate"],
         "task_success_rate": _mean([pair["success"] for task in test.get("tasks", []) for pair in task]),
         "steps_to_goals": _mean([pair["steps"] for pair in reached]),
-        "steps_over_first": sum(a for a, _ in both) / sum(b for _, b in both) if sum(b for _, b in both) else math.nan,
+        "steps_over_first": sum(steps for steps, _ in both) / of_first if of_first else math.nan,
         "times_shortest": math.nan,
         "falls": sum(pair["stuck"] for pair in pairs),
     }
@@ -98,10 +99,8 @@ def rows_of(spec: RunSpec, first: RunSpec, out: pathlib.Path) -> dict[str, list[
     for steps, seconds, test in tests_of(spec, out):
         row = {**key, "steps": steps, "seconds": seconds, **described(test, reference.get(steps, test), shortest)}
         tables["curves"].append(row)
-        promises = [(pair["promised"], pair["success"]) for pair in test["pairs"] if "promised" in pair]
-        promises += [
-            (pair["promised"], pair["success"]) for task in test.get("tasks", []) for pair in task if "promised" in pair
-        ]
+        episodes = [*test["pairs"], *(pair for task in test.get("tasks", []) for pair in task)]
+        promises = [(episode["promised"], episode["success"]) for episode in episodes if "promised" in episode]
         brier = {"brier": brier_score(promises)} if promises else {}
         tables["promises"] += [{**key, "steps": steps, **bin._asdict(), **brier} for bin in calibration(promises)]
     if tables["curves"]:

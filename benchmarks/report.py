@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.collect import RESULTS, Row, names, read
+from benchmarks.collect import RESULTS, Row, read
 
 ROOT = pathlib.Path(__file__).parents[1]
 PAGE, README = ROOT / "docs" / "results.md", ROOT / "README.md"
@@ -44,13 +44,13 @@ OGBENCH = {
     "giant-100": "giant, episodes of 100 steps from anywhere",
     "giant-200": "giant, episodes of 200 steps from anywhere",
 }
-#: Success of the best published method on OGBench's tasks, learned offline from its data (percent, OGBench's paper and later).
+#: Success of the best published method on OGBench's tasks, learned offline from its data.
 PUBLISHED = {"medium": 0.91, "large": 0.88, "giant": 0.92, "teleport": 0.57}
 
 
 def number(value: float, digits: int = 2) -> str:
     """Return a number as text, a dash where there is none."""
-    return "-" if value == "" or math.isnan(value) else f"{value:.{digits}f}"
+    return "-" if math.isnan(value) else f"{value:.{digits}f}"
 
 
 def rate(row: Row) -> str:
@@ -104,8 +104,9 @@ def methods(plan: str) -> str:
     return table(head, lines)
 
 
-def curves(plan: str, method: str, environments: Sequence[str]) -> str:
-    """Return how a method's success grows with the steps, one line for each task."""
+def curves_of(plan: str, method: str) -> str:
+    """Return how a method's success grows with the steps, one line for each of a plan's tasks."""
+    environments = [row["environment"] for row in summary(plan) if row["method"] == method]
     rows = [row for row in read(RESULTS / plan / "curves.csv") if row["method"] == method]
     lines = []
     for environment in environments:
@@ -159,11 +160,10 @@ def straight_on(plan: str) -> str:
     return ", ".join(f"{row['mean']:.2f} ({TASKS[row['environment']]})" for row in rows)
 
 
-def promises(plan: str, environment: str, method: str = "skill-graph") -> str:
+def promises(plan: str, environment: str) -> str:
     """Return what plans promised beside what happened, all seeds and tests together."""
-    mine = [
-        row for row in read(RESULTS / plan / "promises.csv") if (row["environment"], row["method"]) == (environment, method)
-    ]
+    mine = [row for row in read(RESULTS / plan / "promises.csv") if row["environment"] == environment]
+    mine = [row for row in mine if row["method"] == "skill-graph"]
     bins = []
     for low in sorted({row["low"] for row in mine}):
         here = [row for row in mine if row["low"] == low]
@@ -262,11 +262,15 @@ def soak() -> str:
     )
 
 
-def aside(row: Row | None, name: str) -> str:
-    """Return what another method came to, where it was run; a single seed is told."""
-    if row is None:
-        return ""
-    return f"{row[name]:.2f}" + " (one seed)" * (row["seeds"] == 1)
+def beside(rows: dict[tuple[str, str], Row], environment: str, name: str) -> list[str]:
+    """Return what other methods came to, where they were run; a single seed is told.
+
+    :param rows: by environment and method
+    :param environment: which of them
+    :param name: column
+    """
+    others = [rows.get((environment, method)) for method in ("straight-on", "ddpg-her")]
+    return ["" if row is None else f"{row[name]:.2f}" + " (one seed)" * (row["seeds"] == 1) for row in others]
 
 
 def readme_table() -> str:
@@ -281,16 +285,19 @@ def readme_table() -> str:
         rows = {(row["environment"], row["method"]): row for row in summary(plan)}
         for environment in shown:
             ours = rows[environment, "skill-graph"]
-            others = [rows.get((environment, method)) for method in ("straight-on", "ddpg-her")]
-            beside = [aside(row, "mean") for row in others]
-            lines.append((TASKS[environment], str(ours["steps"]), rate(ours), *beside))
+            lines.append((TASKS[environment], str(ours["steps"]), rate(ours), *beside(rows, environment, "mean")))
     official = {(row["environment"], row["method"]): row for row in summary("ogbench")}
     for environment in ("giant", "teleport"):
         ours = official[environment, "skill-graph"]
-        others = [official.get((environment, method)) for method in ("straight-on", "ddpg-her")]
-        beside = [aside(row, "task_success_rate") for row in others]
         success = f"{ours['task_success_rate']:.3f}; best published, offline: {PUBLISHED[environment]}"
-        lines.append((f"{OGBENCH[environment]}, official tasks", str(ours["steps"]), success, *beside))
+        lines.append(
+            (
+                f"{OGBENCH[environment]}, official tasks",
+                str(ours["steps"]),
+                success,
+                *beside(official, environment, "task_success_rate"),
+            )
+        )
     return table(("Task", "Steps of training", "Success", "Straight on", "DDPG + HER"), lines)
 
 
@@ -299,7 +306,7 @@ def page() -> str:
     template = (ROOT / "benchmarks" / "results.template.md").read_text()
     known: dict[str, Callable[..., str]] = {
         function.__name__: function
-        for function in (ants, command, curves_of, few_shot, kept, methods, ogbench, older, promises, scaling, seeds, soak)
+        for function in (ants, command, curves_of, few_shot, kept, methods, ogbench, older, promises, scaling, soak)
     }
     known |= {function.__name__: function for function in (straight_on, throughput, wall_clock)}
 
@@ -308,19 +315,6 @@ def page() -> str:
         return known[name](*(int(word) if word.isdigit() else word for word in arguments))
 
     return re.sub(r"\{\{ ([^}]+) \}\}", fill, template)
-
-
-def curves_of(plan: str, method: str) -> str:
-    """Return the learning curves of a method of a plan, on all its tasks."""
-    rows = [row for row in summary(plan) if row["method"] == method]
-    return curves(plan, method, [row["environment"] for row in rows])
-
-
-def seeds(plan: str) -> str:
-    """Tell how many seeds each method of a plan has."""
-    rows = summary(plan)
-    counts = {name: sorted({row["seeds"] for row in rows if row["method"] == name}) for name in names(rows)}
-    return ", ".join(f"`{name}` {' or '.join(map(str, count))}" for name, count in counts.items())
 
 
 def main() -> None:

@@ -19,14 +19,14 @@ class SearchState(NamedTuple):
     """What a search passes from step to step, as plain arrays.
 
     :param waypoints: stored states that are left on the way, by number, shape ``(n,)``; the goal comes after them
-    :param leg: begin and end of the leg that is walked: numbers of stored states, ``n_states`` for the place it was planned
-        from, ``n_states + 1`` for the goal; shape ``(2,)``
+    :param begin: where the leg that is walked began: number of a stored state, ``n_states`` for the place it was planned
+        from; shape ``()``
     :param left: environment steps that the leg may still take, shape ``()``
-    :param barred: legs that took too long in this episode, shape ``(m, 2)``
+    :param barred: begin and end of legs that took too long in this episode, ``n_states + 1`` for the goal; shape ``(m, 2)``
     """
 
     waypoints: np.ndarray
-    leg: np.ndarray
+    begin: np.ndarray
     left: np.ndarray
     barred: np.ndarray
 
@@ -81,8 +81,8 @@ class ReplaySearch:
 
     def plan(
         self, observation: np.ndarray, place: np.ndarray, goal: np.ndarray, barred: np.ndarray | None = None
-    ) -> list[int] | None:
-        """Return the stored states on the shortest way, by number; None if none leads there.
+    ) -> list[int]:
+        """Return the stored states on the shortest way, by number; none where it is straight on, or no way leads there.
 
         :param observation: shape ``(observation_dim,)``
         :param place: where the agent stands, shape ``(goal_dim,)``
@@ -107,7 +107,7 @@ class ReplaySearch:
         total = away + np.append(cost, 0.0)
         way = [int(total.argmin())]
         if total[way[0]] == np.inf:
-            return None
+            return []
         while way[-1] < self.n_states:
             way.append(int(following[way[-1]]))
         return way[:-1]
@@ -139,34 +139,35 @@ class ReplaySearch:
         :param deterministic: not used: there is no noise
         :return: an action in the environment's own bounds, and the state to pass back in
         """
-        place, goal = observation["achieved_goal"], observation["desired_goal"]
         if state is None:
             now = self._begin(observation, np.empty((0, 2), dtype=int))
         else:
             now = self._go_on(observation, SearchState(*state))
-        target = self.places[now.waypoints[0]] if len(now.waypoints) else goal
-        seen = {"observation": observation["observation"][None], "achieved_goal": place[None]}
-        action = self.agent.parts.walk(seen, target[None])[0]
+        seen = {key: observation[key][None] for key in ("observation", "achieved_goal")}
+        action = self.agent.parts.walk(seen, self._target(observation, now.waypoints)[None])[0]
         return action, tuple(now._replace(left=now.left - 1))
 
     def _begin(self, observation: dict[str, np.ndarray], barred: np.ndarray) -> SearchState:
         """Plan from here."""
         here = (observation["observation"], observation["achieved_goal"], observation["desired_goal"])
-        way = self.plan(*here, barred)
-        return self._walk(observation, self.n_states, np.array(way or [], dtype=int), barred)
+        return self._walk(observation, self.n_states, np.array(self.plan(*here, barred), dtype=int), barred)
+
+    def _target(self, observation: dict[str, np.ndarray], waypoints: np.ndarray) -> np.ndarray:
+        """Return where a leg leads: the next of the stored states, else the goal."""
+        return np.asarray(self.places[waypoints[0]] if len(waypoints) else observation["desired_goal"])
 
     def _walk(self, observation: dict[str, np.ndarray], begin: int, waypoints: np.ndarray, barred: np.ndarray) -> SearchState:
         """Begin a leg."""
-        target = self.places[waypoints[0]] if len(waypoints) else observation["desired_goal"]
+        target = self._target(observation, waypoints)
         expected = self.steps(observation["observation"], observation["achieved_goal"], target)[0]
-        end = waypoints[0] if len(waypoints) else self.n_states + 1
         left = int(timeout(min(expected, self.agent.graph.walk_steps)))
-        return SearchState(waypoints, np.array([begin, end]), np.array(left), barred)
+        return SearchState(waypoints, np.array(begin), np.array(left), barred)
 
     def _go_on(self, observation: dict[str, np.ndarray], state: SearchState) -> SearchState:
         """Take the next leg after an arrival, and plan anew where a leg took too long."""
         if len(state.waypoints) and self.agent.metric.reached(observation["achieved_goal"], self.places[state.waypoints[0]]):
             return self._walk(observation, int(state.waypoints[0]), state.waypoints[1:], state.barred)
         if state.left <= 0:
-            return self._begin(observation, np.vstack([state.barred, state.leg]))
+            end = state.waypoints[0] if len(state.waypoints) else self.n_states + 1
+            return self._begin(observation, np.vstack([state.barred, [state.begin, end]]))
         return state

@@ -35,11 +35,14 @@ class HoldAction(gym.Wrapper):
         """
         total = 0.0
         for _ in range(self.n_steps):
-            observation, reward, terminated, truncated, info = self.env.step(action)
+            observation, reward, terminated, truncated, info = self._step_once(action)
             total += float(reward)
             if terminated or truncated or info.get("stuck"):
                 break
         return observation, total, terminated, truncated, info
+
+    def _step_once(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        return self.env.step(action)
 
 
 class TellStuck(gym.Wrapper):
@@ -82,7 +85,7 @@ def lies_down(quaternion: np.ndarray) -> bool:
     return 1.0 - 2.0 * (x * x + y * y) <= _UPRIGHT
 
 
-class AntRecipe(gym.Wrapper, gym.utils.RecordConstructorArgs):
+class AntRecipe(HoldAction, gym.utils.RecordConstructorArgs):
     """
     gymnasium-robotics' ants as the recipe for ants wants them: with the torque and the control period of D4RL's ant.
 
@@ -95,12 +98,11 @@ class AntRecipe(gym.Wrapper, gym.utils.RecordConstructorArgs):
 
     option_view = "placed_body"
     torque = 0.2
-    n_steps = 2
     n_body = 27  # numbers of the observation that are positions and velocities; contact forces may follow
 
     def __init__(self, env: gym.Env) -> None:
         gym.utils.RecordConstructorArgs.__init__(self)
-        super().__init__(env)
+        super().__init__(env, n_steps=2)
         space = env.observation_space
         body = space["observation"] if isinstance(space, spaces.Dict) and "observation" in space.spaces else space
         if not isinstance(space, spaces.Dict) or not isinstance(body, spaces.Box) or body.shape[0] < self.n_body:
@@ -122,20 +124,9 @@ class AntRecipe(gym.Wrapper, gym.utils.RecordConstructorArgs):
         observation, info = self.env.reset(seed=seed, options=options)
         return self._seen(observation), info
 
-    def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Hold an action until the episode is over or the ant has fallen.
-
-        :param action: shape ``(8,)``
-        :return: last observation, sum of the rewards, terminated, truncated and the last info
-        """
-        total = 0.0
-        for _ in range(self.n_steps):
-            observation, reward, terminated, truncated, info = self.env.step(self.torque * action)
-            total += float(reward)
-            stuck = on_its_back(observation)
-            if terminated or truncated or stuck:
-                break
-        return self._seen(observation), total, terminated, truncated, {**info, "stuck": stuck}
+    def _step_once(self, action: np.ndarray) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        observation, reward, terminated, truncated, info = self.env.step(self.torque * action)
+        return self._seen(observation), reward, terminated, truncated, {**info, "stuck": on_its_back(observation)}
 
 
 class FlattenGoals(gym.ObservationWrapper):

@@ -33,12 +33,7 @@ def load_hyperparams(env_id: str, path: Path = FILE, *, required: bool = False) 
     :raises ValueError: if the file is no YAML of that layout, names an unknown argument or option class, or has no entry
         that is required
     """
-    try:
-        document = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
-    except yaml.YAMLError as error:
-        raise ValueError(f"{path.name} is no valid YAML: {' '.join(str(error).split())}") from error
-    if not isinstance(document, dict):
-        raise ValueError(f"{path.name}: a mapping of environments to arguments is wanted.")
+    document = _read(path)
     if required and env_id not in document:
         raise ValueError(f"{path.name} has no entry {env_id!r}{did_you_mean(env_id, document)}.")
     hyperparams: dict[str, Any] = {}
@@ -49,6 +44,16 @@ def load_hyperparams(env_id: str, path: Path = FILE, *, required: bool = False) 
         settings = {name: value for name, value in values.items() if name != WRAPPER}
         hyperparams.update(check_hyperparams(settings, f"{path.name}, entry {entry!r}"))
     return hyperparams
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        document = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
+    except yaml.YAMLError as error:
+        raise ValueError(f"{path.name} is no valid YAML: {' '.join(str(error).split())}") from error
+    if not isinstance(document, dict):
+        raise ValueError(f"{path.name}: a mapping of environments to arguments is wanted.")
+    return document
 
 
 def _entry_of(env_id: str, entries: Iterable[str]) -> str:
@@ -62,7 +67,7 @@ def recommended_wrapper(env_id: str) -> Callable[[gym.Env], gym.Env] | None:
 
     :param env_id: id of the environment
     """
-    document = yaml.safe_load(FILE.read_text(encoding="utf-8"))
+    document = _read(FILE)
     name = (document.get(_entry_of(env_id, document)) or {}).get(WRAPPER)
     if name is None:
         return None
