@@ -54,6 +54,22 @@ def test_an_action_is_held_for_a_step_at_least(n_steps: Any) -> None:
         HoldAction(Counter(), n_steps)
 
 
+def test_an_environment_with_wrappers_is_made_again_from_its_spec() -> None:
+    gym.register("Line-v0", entry_point=Line)
+    env = PursueGoals(gym.make("Line-v0"), lambda o: o, lambda rng: rng.uniform(-4.0, 4.0, 1), 0.4)
+    env = TellStuck(HoldAction(env, 3), lambda observation: bool(observation["achieved_goal"][0] > 4.0))
+    assert env.spec is not None
+    again = gym.make(env.spec)
+    outcomes = []
+    for each in (env, again):
+        each.reset(seed=0)
+        outcomes.append([each.step(np.ones(1)) for _ in range(4)])
+    for (shown, *outcome, info), (shown_again, *outcome_again, info_again) in zip(*outcomes, strict=True):
+        np.testing.assert_equal(shown_again, shown)
+        assert (outcome_again, info_again) == (outcome, info)
+    assert [info["stuck"] for *_, info in outcomes[0]] == [False, False, True, True]
+
+
 def test_what_an_environment_tells_of_being_stuck_stays() -> None:
     env = TellStuck(Counter(stuck_at=2), lambda observation: bool(observation[0] == 3))
     assert [env.step(np.zeros(1))[-1]["stuck"] for _ in range(4)] == [False, True, True, False]

@@ -12,7 +12,7 @@ from sb3_skillgraph.metric import Product, Within, as_metric
 _UPRIGHT = 0.2  # upward component of the torso's axis below which it lies on its side or back
 
 
-class HoldAction(gym.Wrapper):
+class HoldAction(gym.Wrapper, gym.utils.RecordConstructorArgs):
     """
     Holds every action for some steps, which become one: the control period of a robot that cannot use a shorter one.
 
@@ -22,7 +22,8 @@ class HoldAction(gym.Wrapper):
     """
 
     def __init__(self, env: gym.Env, n_steps: int) -> None:
-        super().__init__(env)
+        gym.utils.RecordConstructorArgs.__init__(self, n_steps=n_steps)
+        gym.Wrapper.__init__(self, env)
         if not isinstance(n_steps, int | np.integer) or n_steps < 1:
             raise ValueError(f"n_steps must be a whole number of steps, at least 1, not {n_steps!r}.")
         self.n_steps = n_steps
@@ -45,7 +46,7 @@ class HoldAction(gym.Wrapper):
         return self.env.step(action)
 
 
-class TellStuck(gym.Wrapper):
+class TellStuck(gym.Wrapper, gym.utils.RecordConstructorArgs):
     """
     Tells in ``info["stuck"]`` when the agent can do nothing any more; where the environment tells so itself, that stays.
 
@@ -54,7 +55,8 @@ class TellStuck(gym.Wrapper):
     """
 
     def __init__(self, env: gym.Env, is_stuck: Callable[[Any], bool]) -> None:
-        super().__init__(env)
+        gym.utils.RecordConstructorArgs.__init__(self, is_stuck=is_stuck)
+        gym.Wrapper.__init__(self, env)
         self.is_stuck = is_stuck
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
@@ -85,7 +87,7 @@ def lies_down(quaternion: np.ndarray) -> bool:
     return 1.0 - 2.0 * (x * x + y * y) <= _UPRIGHT
 
 
-class AntRecipe(HoldAction, gym.utils.RecordConstructorArgs):
+class AntRecipe(HoldAction):
     """
     gymnasium-robotics' ants as the recipe for ants wants them: with the torque and the control period of D4RL's ant.
 
@@ -129,7 +131,7 @@ class AntRecipe(HoldAction, gym.utils.RecordConstructorArgs):
         return self._seen(observation), reward, terminated, truncated, {**info, "stuck": on_its_back(observation)}
 
 
-class FlattenGoals(gym.ObservationWrapper):
+class FlattenGoals(gym.ObservationWrapper, gym.utils.RecordConstructorArgs):
     """
     Makes one vector of goals that are nested dictionaries, such as those of gymnasium-robotics' FrankaKitchen.
 
@@ -141,7 +143,8 @@ class FlattenGoals(gym.ObservationWrapper):
     """
 
     def __init__(self, env: gym.Env, radius: float | dict[str, float]) -> None:
-        super().__init__(env)
+        gym.utils.RecordConstructorArgs.__init__(self, radius=radius)
+        gym.ObservationWrapper.__init__(self, env)
         space = env.observation_space
         goals = space["achieved_goal"] if isinstance(space, spaces.Dict) and "achieved_goal" in space.spaces else space
         if not isinstance(space, spaces.Dict) or not isinstance(goals, spaces.Dict) or goals is space:
@@ -167,7 +170,7 @@ class FlattenGoals(gym.ObservationWrapper):
         }
 
 
-class PursueGoals(gym.Wrapper):
+class PursueGoals(gym.Wrapper, gym.utils.RecordConstructorArgs):
     """
     Makes a goal environment of any environment with Box observations.
 
@@ -188,7 +191,8 @@ class PursueGoals(gym.Wrapper):
         sample_goal: Callable[[np.random.Generator], np.ndarray],
         radius: Any,
     ) -> None:
-        super().__init__(env)
+        gym.utils.RecordConstructorArgs.__init__(self, achieved_goal=achieved_goal, sample_goal=sample_goal, radius=radius)
+        gym.Wrapper.__init__(self, env)
         if not isinstance(env.observation_space, spaces.Box):
             raise ValueError(f"PursueGoals is for environments with Box observations, not {env.observation_space}.")
         self._achieved_goal, self._sample_goal = achieved_goal, sample_goal
