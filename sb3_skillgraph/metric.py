@@ -321,6 +321,7 @@ class Custom(Metric):
 
     def __init__(self, function: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> None:
         self.function = function
+        self._reach: dict[int, np.ndarray] = {}  # by length of a goal
 
     def __repr__(self) -> str:
         return getattr(self.function, "__name__", repr(self.function))
@@ -330,12 +331,20 @@ class Custom(Metric):
         return np.asarray(self.function(np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64)))
 
     def embed(self, points: np.ndarray) -> np.ndarray:
-        """Return the points as they are."""
-        return points.astype(np.float32)
+        """Return points in what :meth:`reach` tells of each dimension."""
+        return (points / self.reach(np.shape(points)[-1])).astype(np.float32)
 
     def reach(self, goal_dim: int) -> np.ndarray:
-        """Nothing is known of it."""
-        return np.ones(goal_dim)
+        """Return how far off a goal is, in each dimension alone, that is no longer reached, from 0 on and to a factor of two.
+
+        A dimension in which that is never so is taken as it is.
+        """
+        if goal_dim not in self._reach:
+            far = 2.0 ** np.arange(-30.0, 31.0)
+            goals = far[:, None, None] * np.eye(goal_dim)
+            missed = self.distance(np.zeros_like(goals), goals) > self.radius  # (distances, dimensions)
+            self._reach[goal_dim] = np.where(missed.any(axis=0), far[missed.argmax(axis=0)], 1.0)
+        return self._reach[goal_dim]
 
     def get_state(self) -> Any:
         """Return the function."""

@@ -161,6 +161,15 @@ def test_poses_of_a_hand_are_reached_where_the_environment_says_so(id: str) -> N
 # -- agents -----------------------------------------------------------------------------------------------------------
 
 
+def test_networks_see_goals_of_a_users_own_metric_in_its_units() -> None:
+    metric = as_metric(lambda a, b: np.abs(a - b) @ np.array([1 / 0.0144, 1 / 40.0, 0.0]))
+    units = metric.reach(3)
+    for i, radius in enumerate((0.0144, 40.0)):
+        assert radius < units[i] <= 2.0 * radius
+    assert units[2] == 1.0  # it does not matter, and is taken as it is
+    np.testing.assert_allclose(metric.embed(np.array([[0.0288, -80.0, 3.0]])), [[0.0288, -80.0, 3.0] / units], rtol=1e-6)
+
+
 class WithHeading(gym.ObservationWrapper):
     """Goals get an angle, which the first action turns by, and a number that does not matter."""
 
