@@ -27,12 +27,13 @@ from sb3_skillgraph.learning.salience import Salience
 from sb3_skillgraph.metric import Metric, MetricFunction
 from sb3_skillgraph.options.learner import OptionDDPG
 from sb3_skillgraph.options.option import Option
+from sb3_skillgraph.options.parameters import parameters, set_parameters
 from sb3_skillgraph.options.views import View
 from sb3_skillgraph.options.walk import Walks
 from sb3_skillgraph.parts import Parts
 from sb3_skillgraph.plan import Plan
 from sb3_skillgraph.rules import PaperRules
-from sb3_skillgraph.runner import Run, RunnerState
+from sb3_skillgraph.running import Run, RunnerState
 from sb3_skillgraph.saving import PathOrFile, load_tree, save_tree
 from sb3_skillgraph.schema import check_learned
 from sb3_skillgraph.vec_env import LeanVecEnv
@@ -393,7 +394,7 @@ class SkillGraphAgent(OffPolicyAlgorithm):
         happened in the episode. Without it the agent plans at every step, and learns nothing from what has just failed.
 
         :param observation: one Dict observation, or a batch with a leading axis
-        :param state: what the last call returned; see :class:`~sb3_skillgraph.runner.RunnerState`
+        :param state: what the last call returned; see :class:`~sb3_skillgraph.running.RunnerState`
         :param episode_start: where an episode begins, and the state is forgotten; shape ``(n_envs,)``
         :param deterministic: not used: no noise is added either way
         :return: actions in the environment's own bounds, and the state
@@ -510,7 +511,7 @@ class SkillGraphAgent(OffPolicyAlgorithm):
 
     def get_parameters(self) -> dict[str, Any]:
         """Return the parameters of the walker's networks and optimisers: state dicts under SB3's names."""
-        return persistence.parameters(self.parts.walker.learner)
+        return parameters(self.parts.walker.learner)
 
     def set_parameters(
         self, load_path_or_dict: str | dict[str, Any], exact_match: bool = True, device: th.device | str = "auto"
@@ -523,7 +524,7 @@ class SkillGraphAgent(OffPolicyAlgorithm):
         """
         learner = self.parts.walker.learner
         if isinstance(load_path_or_dict, dict):
-            persistence.set_parameters(learner, load_path_or_dict, exact_match, device)
+            set_parameters(learner, load_path_or_dict, exact_match, device)
         else:
             persistence.load_parameters(learner, load_tree(load_path_or_dict, "agent"), exact_match, device)
         self.parts.average.restart()

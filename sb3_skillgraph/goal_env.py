@@ -267,3 +267,23 @@ class Oracle:
         # The environment may live in another process, which gets a copy of the generator: give it one of its own.
         child = np.random.default_rng(rng.integers(2**63))
         return np.asarray(env.env_method("sample_free", child, indices=0)[0], dtype=np.float64)
+
+
+def describe_space(space: spaces.Space) -> dict[str, Any]:
+    """Return a space of goal environments as plain data.
+
+    :raises ValueError: if it is of another kind
+    """
+    if isinstance(space, spaces.Dict):
+        return {"entries": {key: describe_space(entry) for key, entry in space.spaces.items()}}
+    if isinstance(space, spaces.Box):
+        return {"low": space.low, "high": space.high}
+    raise ValueError(f"A space of this kind cannot be saved: {space}.")
+
+
+def make_space(description: dict[str, Any]) -> spaces.Space:
+    """Return the space that :func:`describe_space` described."""
+    if "entries" in description:
+        return spaces.Dict({key: make_space(entry) for key, entry in description["entries"].items()})
+    low: np.ndarray = description["low"]
+    return spaces.Box(low, description["high"], dtype=low.dtype)

@@ -2,13 +2,27 @@
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from sb3_skillgraph.checking import HUGE
+from sb3_skillgraph.metric_parts import Angle, Exact, Part, Rotation, Within, norm, positive_radius
+
+__all__ = [
+    "Angle",
+    "Ball",
+    "Custom",
+    "Exact",
+    "Metric",
+    "MetricFunction",
+    "Part",
+    "Product",
+    "Rotation",
+    "Within",
+    "as_metric",
+]
 
 #: Radii by which goals are apart, beside all else, for every dimension that has to match and does not: no event is so large.
 MISMATCH = 1_000.0
@@ -81,14 +95,14 @@ class Ball(Metric):
     radius: float
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "radius", _positive(self.radius))
+        object.__setattr__(self, "radius", positive_radius(self.radius))
 
     def __repr__(self) -> str:
         return f"{self.radius:g}"
 
     def distance(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
         """Return the Euclidean distance, shape ``(...)``."""
-        return _length(a - b)
+        return norm(a - b)
 
     def reached(self, point: np.ndarray, goal: np.ndarray) -> bool:
         """Tell whether a goal is reached: asked at every step, where arrays cost too much."""
@@ -105,135 +119,6 @@ class Ball(Metric):
     def get_state(self) -> float:
         """Return the radius."""
         return self.radius
-
-
-# -- goals with several units ------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Part(ABC):
-    """Some dimensions of a goal that are measured together.
-
-    :param dims: which, counted from 0
-    """
-
-    dims: Sequence[int]
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "dims", tuple(int(i) for i in self.dims))
-
-    @abstractmethod
-    def embed(self, points: np.ndarray) -> np.ndarray:
-        """Return coordinates between which the Euclidean distance is 1 for points that are a radius apart.
-
-        :param points: of these dimensions only, shape ``(..., len(dims))``
-        """
-
-    @property
-    @abstractmethod
-    def reach(self) -> float:
-        """About how far off a goal may be in each of these dimensions; 0 where that means nothing."""
-
-    def nearest_goal(self, point: np.ndarray) -> np.ndarray:
-        """Return what could be part of a goal, shape ``(len(dims),)``."""
-        return point
-
-
-@dataclass(frozen=True)
-class Within(Part):
-    """Positions and other numbers: Euclidean distance.
-
-    :param dims: which dimensions
-    :param radius: within which they have to be, together
-    """
-
-    radius: float
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        object.__setattr__(self, "radius", _positive(self.radius))
-
-    def embed(self, points: np.ndarray) -> np.ndarray:
-        """Return the numbers in radii."""
-        return points / self.radius
-
-    @property
-    def reach(self) -> float:
-        """The radius."""
-        return self.radius
-
-
-@dataclass(frozen=True)
-class Angle(Within):
-    """Angles, each the same after a whole turn.
-
-    :param dims: which dimensions
-    :param radius: within which each has to be, in radians
-    """
-
-    def embed(self, points: np.ndarray) -> np.ndarray:
-        """Return points of circles on which the radius is a chord of length 1."""
-        return np.concatenate([np.cos(points), np.sin(points)], axis=-1) / _chord(self.radius)
-
-    def nearest_goal(self, point: np.ndarray) -> np.ndarray:
-        """Return the angles between -pi and pi."""
-        return (point + np.pi) % (2.0 * np.pi) - np.pi
-
-
-@dataclass(frozen=True)
-class Rotation(Within):
-    """A rotation in space as a unit quaternion (w, x, y, z), the same as its negative.
-
-    :param dims: the four dimensions
-    :param radius: the angle, in radians, by which it may be off
-    """
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if len(self.dims) != 4:
-            raise ValueError(f"A rotation is a quaternion of 4 numbers, not of {len(self.dims)}.")
-
-    def embed(self, points: np.ndarray) -> np.ndarray:
-        """Return rotation matrices, shape ``(..., 9)``: the distance between two follows from the angle between them."""
-        length = np.maximum(_length(points)[..., None], 1e-9)
-        w, x, y, z = np.moveaxis(points / length, -1, 0)
-        rows = [
-            [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
-            [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
-            [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
-        ]
-        matrices = np.stack([entry for row in rows for entry in row], axis=-1)
-        return matrices / (np.sqrt(2.0) * _chord(self.radius))
-
-    @property
-    def reach(self) -> float:
-        """How much a number of the quaternion changes by a turn of the radius."""
-        return math.sin(0.5 * self.radius)
-
-    def nearest_goal(self, point: np.ndarray) -> np.ndarray:
-        """Return the quaternion of length 1."""
-        return point / max(float(np.linalg.norm(point)), 1e-9)
-
-
-@dataclass(frozen=True)
-class Exact(Part):
-    """Whole numbers, such as whether a key has been fetched: they match, or a goal is not reached.
-
-    :param dims: which dimensions
-    """
-
-    def embed(self, points: np.ndarray) -> np.ndarray:
-        """Return the numbers as they are."""
-        return points
-
-    @property
-    def reach(self) -> float:
-        """Nothing between two values is a goal."""
-        return 0.0
-
-    def nearest_goal(self, point: np.ndarray) -> np.ndarray:
-        """Return whole numbers."""
-        return np.round(point)
 
 
 class Product(Metric):
@@ -288,7 +173,7 @@ class Product(Metric):
         """Return how far off the part is that is furthest off, shape ``(...)``."""
         a, b = np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64)
         dims = [list(part.dims) for part in self._measured]
-        away = [_length(part.embed(a[..., i]) - part.embed(b[..., i])) for part, i in zip(self._measured, dims, strict=True)]
+        away = [norm(part.embed(a[..., i]) - part.embed(b[..., i])) for part, i in zip(self._measured, dims, strict=True)]
         return np.max(np.broadcast_arrays(*away), axis=0)
 
     def embed(self, points: np.ndarray) -> np.ndarray:
@@ -382,18 +267,3 @@ def as_metric(given: Any) -> Metric:
 
 def _part(kind: str, **arguments: Any) -> Part:
     return _PARTS[kind](**arguments)
-
-
-def _positive(radius: Any) -> float:
-    if isinstance(radius, bool) or not isinstance(radius, int | float | np.number) or not 0 < radius <= HUGE:
-        raise ValueError(f"event_radius must be a positive number, or a metric, not {radius!r}.")
-    return float(radius)
-
-
-def _length(vectors: np.ndarray) -> np.ndarray:
-    return np.sqrt(np.einsum("...i,...i->...", vectors, vectors))
-
-
-def _chord(angle: float) -> float:
-    """Return the distance between two points of a circle of radius 1 that are an angle apart (half a turn at most)."""
-    return 2.0 * math.sin(0.5 * min(angle, math.pi))

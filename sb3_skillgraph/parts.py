@@ -18,12 +18,13 @@ from sb3_skillgraph.metric import Metric
 from sb3_skillgraph.options.average import AveragedPolicy
 from sb3_skillgraph.options.factory import OptionFactory, copy_policy
 from sb3_skillgraph.options.option import Option
+from sb3_skillgraph.options.parameters import set_skill_state, skill_state
 from sb3_skillgraph.options.views import ScaledView
 from sb3_skillgraph.options.walk import Walk, Walks
-from sb3_skillgraph.persistence import set_skill_state, skill_state
 from sb3_skillgraph.plan import Plan, describe
 from sb3_skillgraph.planning import Planner
-from sb3_skillgraph.runner import Runner, RunnerState
+from sb3_skillgraph.runner import Runner
+from sb3_skillgraph.running import RunnerState
 from sb3_skillgraph.walk_model import WalkModel
 
 #: Steps ahead from which hindsight draws achieved goals.

@@ -12,16 +12,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
-from gymnasium import spaces
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.noise import ActionNoise, VectorizedActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.save_util import recursive_getattr
 from stable_baselines3.common.utils import check_for_correct_spaces
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_skillgraph.goal_env import refuse_changed_goals
+from sb3_skillgraph.goal_env import describe_space, make_space, refuse_changed_goals
 from sb3_skillgraph.options.learner import OptionDDPG, OptionLearner, OptionTD3
+from sb3_skillgraph.options.parameters import parameters, set_parameters
 from sb3_skillgraph.rules import PaperRules
 from sb3_skillgraph.saving import MissingCallable, PathOrFile, check_encoding, known_class, load_tree
 from sb3_skillgraph.schema import check_header, check_learned, check_parameters, finite
@@ -280,49 +279,6 @@ def restore_env(agent: Any) -> bool:
     return True
 
 
-def parameters(learner: OffPolicyAlgorithm) -> dict[str, Any]:
-    """Return a model's state dicts by SB3's names, and under ``"variables"`` its tensors that belong to no network.
-
-    :param learner: an SB3 model
-    """
-    names = learner._get_torch_save_params()[1]
-    variables = {name: recursive_getattr(learner, name).data for name in names}
-    return {**learner.get_parameters(), **({"variables": variables} if variables else {})}
-
-
-def set_parameters(learner: OffPolicyAlgorithm, given: dict[str, Any], exact_match: bool, device: Any) -> None:
-    """Set what :func:`parameters` returned.
-
-    :param learner: an SB3 model
-    :param given: the parameters
-    :param exact_match: whether every parameter must be given
-    :param device: torch device
-    """
-    given = dict(given)
-    for name, tensor in given.pop("variables", {}).items():
-        recursive_getattr(learner, name).data.copy_(tensor)
-    learner.set_parameters(given, exact_match, device)
-
-
-def skill_state(skill: Any) -> dict[str, Any]:
-    """Return an option with a network of its own as plain data.
-
-    :param skill: an :class:`~sb3_skillgraph.options.option.Option`
-    """
-    return {"record": skill.get_state(), "parameters": parameters(skill.learner)}
-
-
-def set_skill_state(skill: Any, state: dict[str, Any], device: Any) -> None:
-    """Restore what :func:`skill_state` returned.
-
-    :param skill: a new option
-    :param state: the state
-    :param device: torch device
-    """
-    skill.set_state(state["record"])
-    set_parameters(skill.learner, state["parameters"], True, device)
-
-
 def load_parameters(learner: OffPolicyAlgorithm, tree: dict[str, Any], exact_match: bool, device: Any) -> None:
     """Set the parameters that a saved agent has; all of them, or none.
 
@@ -387,23 +343,3 @@ def require_callables(arguments: Any, name: str = "") -> None:
             require_callables(value, name)
     elif isinstance(arguments, ActionNoise):
         require_callables(vars(arguments), name)
-
-
-def describe_space(space: spaces.Space) -> dict[str, Any]:
-    """Return a space of goal environments as plain data.
-
-    :raises ValueError: if it is of another kind
-    """
-    if isinstance(space, spaces.Dict):
-        return {"entries": {key: describe_space(entry) for key, entry in space.spaces.items()}}
-    if isinstance(space, spaces.Box):
-        return {"low": space.low, "high": space.high}
-    raise ValueError(f"A space of this kind cannot be saved: {space}.")
-
-
-def make_space(description: dict[str, Any]) -> spaces.Space:
-    """Return the space that :func:`describe_space` described."""
-    if "entries" in description:
-        return spaces.Dict({key: make_space(entry) for key, entry in description["entries"].items()})
-    low: np.ndarray = description["low"]
-    return spaces.Box(low, description["high"], dtype=low.dtype)

@@ -7,7 +7,8 @@ import numpy as np
 from sb3_skillgraph.choices import PESSIMISTIC
 from sb3_skillgraph.edges import NOWHERE
 from sb3_skillgraph.planning import DIRECT, GOAL, Solution
-from sb3_skillgraph.runner import Runner, RunnerState
+from sb3_skillgraph.runner import Runner
+from sb3_skillgraph.running import RunnerState
 
 Status = Literal["in_graph", "in_initiation_set", "outside"]
 

@@ -1,7 +1,6 @@
 """Running options, one environment step at a time: the same in ``learn`` and in ``predict`` (sections 3.2.4, A.6)."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -13,110 +12,8 @@ from sb3_skillgraph.options.numpy_actor import NumpyActor
 from sb3_skillgraph.options.option import Option
 from sb3_skillgraph.options.views import View
 from sb3_skillgraph.planning import DIRECT, GOAL, Planner, Solution
+from sb3_skillgraph.running import STILL_STEPS, Run, RunnerState
 from sb3_skillgraph.walk_model import timeout
-
-#: Different runs of an episode that are told apart; more are counted with others that began with the same option.
-MAX_RUNS = 256
-ID = "U16"  # NumPy's type of ids
-#: An agent stands still if nothing that it sees changes, in so many steps in a row, by more than this share of what it changes
-#: by when the agent moves: what a policy without noise does there it will do for ever. (Five agents with dead spots reached
-#: .74 of their goals with 8 steps, .69 with 5, .65 without.)
-STILL_STEPS, STILL = 8, 0.01
-#: A pace grows by this factor in a step at most, and shrinks by that one: a single jump, into a teleporter say, is no pace.
-FASTER, SLOWER = 2.0, 0.99
-
-
-class RunnerState(NamedTuple):
-    """All that must be remembered between two steps, as plain arrays with one entry for each environment.
-
-    States are never changed in place: the one before and the one after a step may share arrays.
-
-    :param option: id of the running option, empty if none runs; shape ``(n_envs,)`` like all but the runs
-    :param began: id of the event it began in, empty if in none
-    :param aim: where it walks to, shape ``(n_envs, goal_dim)``
-    :param steps: environment steps it has run
-    :param timeout: environment steps it may run
-    :param arrived: id of the event that the last option has led to, where the next one begins; empty after a failure
-    :param elapsed: environment steps of the episode so far
-    :param seen: what was seen last, observation and achieved goal, shape ``(n_envs, observation_dim + goal_dim)``
-    :param pace: by how much each entry of it changes in a step when the agent moves, same shape
-    :param still: steps of the running option in a row in which hardly anything has changed
-    :param run_event: the episode's runs: where they began, shape ``(n_envs, MAX_RUNS)`` like all that follow
-    :param run_option: which option it was, empty where there is no run
-    :param run_landing: in which event it ended, or ``goal``
-    :param run_success: whether it reached its termination set
-    :param run_steps: the environment steps they took together
-    :param run_count: how many there were of the same kind
-    """
-
-    option: np.ndarray
-    began: np.ndarray
-    aim: np.ndarray
-    steps: np.ndarray
-    timeout: np.ndarray
-    arrived: np.ndarray
-    elapsed: np.ndarray
-    seen: np.ndarray
-    pace: np.ndarray
-    still: np.ndarray
-    run_event: np.ndarray
-    run_option: np.ndarray
-    run_landing: np.ndarray
-    run_success: np.ndarray
-    run_steps: np.ndarray
-    run_count: np.ndarray
-
-    @classmethod
-    def fresh(cls, n_envs: int, goal_dim: int, observation_dim: int) -> "RunnerState":
-        """Return the state at the start of an episode."""
-        ids, numbers = np.zeros(n_envs, dtype=ID), np.zeros(n_envs)
-        aim, seen = np.zeros((n_envs, goal_dim), dtype=np.float32), np.zeros((n_envs, observation_dim + goal_dim))
-        run_ids, run_numbers = np.zeros((n_envs, MAX_RUNS), dtype=ID), np.zeros((n_envs, MAX_RUNS))
-        running = (ids, ids, aim, numbers, numbers, ids, numbers, seen, seen, numbers)
-        return cls(*running, run_ids, run_ids, run_ids, run_numbers.astype(bool), run_numbers, run_numbers)
-
-    def begun_anew(self, where: np.ndarray, *, same_episode: bool = False) -> "RunnerState":
-        """Return a state that is fresh for some environments.
-
-        :param where: for which, bool array of shape ``(n_envs,)``
-        :param same_episode: whether the episode goes on there, with something else to do: then how the agent moves is known
-        """
-        goal_dim = self.aim.shape[1]
-        fresh = RunnerState.fresh(len(where), goal_dim, self.seen.shape[1] - goal_dim)
-        if same_episode:
-            fresh = fresh._replace(elapsed=self.elapsed, seen=self.seen, pace=self.pace)
-        pairs = zip(fresh, self, strict=True)
-        return RunnerState(*(np.where(where.reshape(-1, *[1] * (new.ndim - 1)), new, old) for new, old in pairs))
-
-    def copy(self) -> "RunnerState":
-        """Return a copy that shares no memory."""
-        return RunnerState(*(array.copy() for array in self))
-
-
-@dataclass(frozen=True)
-class Run:
-    """The end of one run of an option.
-
-    :param env: which environment
-    :param event: id of the event it began in, empty if in none
-    :param option: id of the option
-    :param landing: id of the event it ended in, ``goal`` for the goal, empty for none
-    :param success: whether it reached its termination set
-    :param steps: environment steps it took
-    :param aim: where it walked to, shape ``(goal_dim,)``
-    :param stood_still: whether it ended since the agent stood still
-    :param stuck: whether it ended since the agent can do nothing any more
-    """
-
-    env: int
-    event: str
-    option: str
-    landing: str
-    success: bool
-    steps: int
-    aim: np.ndarray
-    stood_still: bool = False
-    stuck: bool = False
 
 
 class Chosen(NamedTuple):
@@ -199,7 +96,7 @@ class Runner:
         if runs:
             state = state.copy()
             for run in runs:
-                self._end(state, run)
+                state.end(run)
         return state, runs
 
     def _has_arrived(self, option: str, point: np.ndarray, aim: np.ndarray) -> bool:
@@ -219,28 +116,6 @@ class Runner:
         steps, aim = int(state.steps[i]), state.aim[i].copy()
         return Run(i, str(state.began[i]), option, landing, arrived, steps, aim, stood_still, lost)
 
-    def _end(self, state: RunnerState, run: Run) -> None:
-        """Write a run into the record of the episode, in place."""
-        i = run.env
-        state.option[i] = ""
-        state.arrived[i] = run.landing if run.success and run.landing != GOAL else ""
-        known = state.run_option[i] == run.option
-        same = known & (state.run_event[i] == run.event) & (state.run_landing[i] == run.landing)
-        same &= state.run_success[i] == run.success
-        free = state.run_option[i] == ""
-        # Where the record is full the run counts with others of its option, or else with the rarest.
-        for candidates in (same, free, known):
-            if candidates.any():
-                slot = int(candidates.argmax())
-                break
-        else:
-            slot = int(state.run_count[i].argmin())
-        if not state.run_option[i, slot]:
-            state.run_event[i, slot], state.run_option[i, slot] = run.event, run.option
-            state.run_landing[i, slot], state.run_success[i, slot] = run.landing, run.success
-        state.run_steps[i, slot] += run.steps
-        state.run_count[i, slot] += 1
-
     def act(
         self,
         observation: dict[str, np.ndarray],
@@ -259,7 +134,9 @@ class Runner:
         :return: actions scaled to [-1, 1], shape ``(n_envs, action_dim)``, and the state after the step
         """
         points = observation["achieved_goal"]
-        state = self._with_stillness(state, np.concatenate([observation["observation"], points], axis=1, dtype=np.float64))
+        state = state.having_seen(np.concatenate([observation["observation"], points], axis=1, dtype=np.float64))
+        if self.rules is None:  # the paper's know no such thing
+            state = state._replace(timeout=np.where(state.still >= STILL_STEPS, 0.0, state.timeout))
         idle = np.flatnonzero(state.option == "").tolist()
         if idle:
             state = state.copy()
@@ -273,19 +150,6 @@ class Runner:
             if option in self.skills:
                 actions[i] = self.skills[option].actor.act(seen[i : i + 1])[0]
         return actions, state._replace(steps=state.steps + 1, elapsed=state.elapsed + 1)
-
-    def _with_stillness(self, state: RunnerState, seen: np.ndarray) -> RunnerState:
-        """Return the state with what has changed since the last step.
-
-        Who stands still has no time after this one, but for the paper's rules, which know no such thing.
-        """
-        change = np.abs(seen - state.seen) * (state.elapsed > 0)[:, None]
-        most = np.where(state.pace > 0.0, FASTER * state.pace, change)
-        pace = np.maximum(SLOWER * state.pace, np.minimum(change, most))
-        stands = (change <= STILL * pace).all(axis=1) & (state.elapsed > 0)
-        still = np.where(stands, state.still + 1, 0)
-        time = state.timeout if self.rules is not None else np.where(still >= STILL_STEPS, 0.0, state.timeout)
-        return state._replace(seen=seen, pace=pace, still=still, timeout=time)
 
     # -- choosing an option -------------------------------------------------------------------------------------------
 

@@ -33,7 +33,7 @@ from sb3_skillgraph.checking import (
 )
 from sb3_skillgraph.edges import MAX_LANDINGS, NOWHERE
 from sb3_skillgraph.learning.witness import N_SAMPLES
-from sb3_skillgraph.runner import RunnerState
+from sb3_skillgraph.running import RunnerState
 from sb3_skillgraph.walk_model import N_FEATURES
 
 #: Environments that an agent may have had.

@@ -17,6 +17,7 @@ FLOORS: dict[str, float] = {
     "interrupts": 0,
     "rules": 0,  # numbers
     "vec_env": 0,
+    "metric_parts": 0.05,
     "metric": 0.1,  # knows how large numbers may be
     "events": 0.5,
     "checking": 0,
@@ -33,6 +34,7 @@ FLOORS: dict[str, float] = {
     "choices": 5,
     "choice_model": 6,
     "planning": 7,
+    "running": 7.5,  # which options run, and have run
     "runner": 8,
     "plan": 9,  # the runner's plans for people to read
     "learning": 9,

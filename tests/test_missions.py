@@ -15,7 +15,8 @@ from sb3_skillgraph.learning.salience import MARGIN, FrontierSalience, RandomSal
 from sb3_skillgraph.learning.witness import Witness
 from sb3_skillgraph.memory.store import TransitionStore
 from sb3_skillgraph.planning import Planner
-from sb3_skillgraph.runner import Run, Runner
+from sb3_skillgraph.runner import Runner
+from sb3_skillgraph.running import Run
 from sb3_skillgraph.walk_model import WalkModel
 
 EXPLORATION, BEYOND = 7, 3.0

@@ -24,7 +24,7 @@ from sb3_skillgraph.paper.missions import PaperMissions
 from sb3_skillgraph.paper.policy import PaperPolicy
 from sb3_skillgraph.planning import DIRECT, GOAL
 from sb3_skillgraph.plotting import event_links, plot_skill_graph
-from sb3_skillgraph.runner import RunnerState
+from sb3_skillgraph.running import RunnerState
 
 RADIUS = 0.5
 NEAR = np.array([0.1, 0.0])

@@ -19,7 +19,8 @@ from sb3_skillgraph.edges import MAX_LANDINGS, NOWHERE
 from sb3_skillgraph.graph import SkillGraph
 from sb3_skillgraph.plan import Plan, describe
 from sb3_skillgraph.planning import FOR_GOOD, LEAST, LOST_HORIZONS, Planner, Solution
-from sb3_skillgraph.runner import Runner, RunnerState
+from sb3_skillgraph.runner import Runner
+from sb3_skillgraph.running import RunnerState
 from sb3_skillgraph.walk_model import FIRST_GUESS, WalkModel, timeout
 
 HORIZON = 1_000

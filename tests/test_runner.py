@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 
 from sb3_skillgraph.graph import SkillGraph
 from sb3_skillgraph.planning import Planner
-from sb3_skillgraph.runner import MAX_RUNS, STILL_STEPS, Run, Runner, RunnerState
+from sb3_skillgraph.runner import Runner
+from sb3_skillgraph.running import MAX_RUNS, STILL_STEPS, Run, RunnerState
 from sb3_skillgraph.walk_model import WalkModel, timeout
 
 STEP = 0.5

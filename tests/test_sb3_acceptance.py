@@ -45,7 +45,7 @@ from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecFrameStack
 
 from sb3_skillgraph import SkillGraphAgent
-from sb3_skillgraph.runner import RunnerState
+from sb3_skillgraph.running import RunnerState
 
 
 class Counting(BaseCallback):

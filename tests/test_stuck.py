@@ -20,7 +20,7 @@ from sb3_skillgraph.events import Event
 from sb3_skillgraph.learning import episodes
 from sb3_skillgraph.planning import DIRECT
 from sb3_skillgraph.plotting import run_plan
-from sb3_skillgraph.runner import Run, RunnerState
+from sb3_skillgraph.running import Run, RunnerState
 
 PIT, DEPTH = np.array([0.0, 1.4]), 0.45  # beside the way from the toy maze's start
 

@@ -11,7 +11,7 @@ from sb3_skillgraph.choice_model import ChoiceModel
 from sb3_skillgraph.choices import EXPECTED
 from sb3_skillgraph.graph import MAX_DEGREE, SkillGraph
 from sb3_skillgraph.learning.witness import FIT_EVERY, Witness
-from sb3_skillgraph.runner import Run
+from sb3_skillgraph.running import Run
 from sb3_skillgraph.walk_model import FIRST_GUESS, HASTY_LOSS, WalkModel, timeout
 
 seeds = st.integers(0, 100_000)

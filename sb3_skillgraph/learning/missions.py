@@ -9,7 +9,7 @@ import numpy as np
 from sb3_skillgraph.edges import NOWHERE
 from sb3_skillgraph.graph import SkillGraph
 from sb3_skillgraph.learning.salience import Salience, box_around
-from sb3_skillgraph.runner import Run
+from sb3_skillgraph.running import Run
 
 #: Failed runs after which a mission is given up.
 MAX_FAILURES = 3

@@ -11,7 +11,8 @@ from sb3_skillgraph.learning.scale import Scale
 from sb3_skillgraph.learning.witness import Witness
 from sb3_skillgraph.memory.store import TransitionStore
 from sb3_skillgraph.planning import DIRECT
-from sb3_skillgraph.runner import Runner, RunnerState
+from sb3_skillgraph.runner import Runner
+from sb3_skillgraph.running import RunnerState
 
 #: A random action is held for so many environment steps in the mean: single ones average out.
 HOLD = 10

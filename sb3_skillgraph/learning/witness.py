@@ -10,7 +10,7 @@ from sb3_skillgraph.choices import EXPECTED
 from sb3_skillgraph.edges import NOWHERE
 from sb3_skillgraph.graph import SkillGraph
 from sb3_skillgraph.planning import DIRECT
-from sb3_skillgraph.runner import Run
+from sb3_skillgraph.running import Run
 from sb3_skillgraph.walk_model import HASTY_LOSS, Kind, timeout
 
 #: Environment steps between two fits of the model of untried walks.

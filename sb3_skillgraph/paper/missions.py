@@ -12,7 +12,7 @@ from sb3_skillgraph.learning.salience import Salience
 from sb3_skillgraph.paper.chaining import DeepSkillChaining
 from sb3_skillgraph.paper.graph import PaperGraph
 from sb3_skillgraph.rules import PaperRules
-from sb3_skillgraph.runner import Run
+from sb3_skillgraph.running import Run
 
 _COUNTERS = ("n_episodes", "last_accepted", "last_rejected", "newest")
 

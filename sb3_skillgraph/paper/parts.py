@@ -12,16 +12,17 @@ from sb3_skillgraph.goal_env import GoalSpec
 from sb3_skillgraph.metric import Ball
 from sb3_skillgraph.options.average import AveragedPolicy
 from sb3_skillgraph.options.option import Option
+from sb3_skillgraph.options.parameters import set_skill_state, skill_state
 from sb3_skillgraph.paper.chaining import DeepSkillChaining
 from sb3_skillgraph.paper.graph import PaperGraph
 from sb3_skillgraph.paper.missions import PaperMissions
 from sb3_skillgraph.paper.policy import PaperPolicy
 from sb3_skillgraph.paper.witness import PaperWitness
 from sb3_skillgraph.parts import Common, Parts
-from sb3_skillgraph.persistence import set_skill_state, skill_state
 from sb3_skillgraph.plan import Plan
 from sb3_skillgraph.planning import Planner
-from sb3_skillgraph.runner import Runner, RunnerState
+from sb3_skillgraph.runner import Runner
+from sb3_skillgraph.running import RunnerState
 from sb3_skillgraph.walk_model import WalkModel
 
 

@@ -10,7 +10,8 @@ from sb3_skillgraph.paper.chaining import DeepSkillChaining
 from sb3_skillgraph.paper.graph import PaperGraph
 from sb3_skillgraph.plan import Plan, Status
 from sb3_skillgraph.planning import DIRECT, GOAL, TIME_BINS
-from sb3_skillgraph.runner import Chosen, RunnerState
+from sb3_skillgraph.runner import Chosen
+from sb3_skillgraph.running import RunnerState
 
 
 class Way(NamedTuple):

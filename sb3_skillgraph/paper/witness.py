@@ -7,7 +7,7 @@ import numpy as np
 from sb3_skillgraph.paper.chaining import DeepSkillChaining
 from sb3_skillgraph.paper.graph import PaperGraph
 from sb3_skillgraph.paper.missions import PaperMissions
-from sb3_skillgraph.runner import Run
+from sb3_skillgraph.running import Run
 
 
 class PaperWitness:

@@ -9,7 +9,8 @@ from sb3_skillgraph.choices import Choices
 from sb3_skillgraph.options.execution import Fate, fate
 from sb3_skillgraph.options.option import Option
 from sb3_skillgraph.planning import DIRECT
-from sb3_skillgraph.runner import Chosen, Runner, RunnerState
+from sb3_skillgraph.runner import Chosen, Runner
+from sb3_skillgraph.running import RunnerState
 
 Observation = dict[str, np.ndarray]
 
