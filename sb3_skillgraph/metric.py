@@ -206,7 +206,7 @@ class Custom(Metric):
 
     def __init__(self, function: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> None:
         self.function = function
-        self._reach: dict[int, np.ndarray] = {}  # by length of a goal
+        self._known_units: dict[int, np.ndarray] = {}  # by length of a goal
 
     def __repr__(self) -> str:
         return getattr(self.function, "__name__", repr(self.function))
@@ -216,20 +216,27 @@ class Custom(Metric):
         return np.asarray(self.function(np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64)))
 
     def embed(self, points: np.ndarray) -> np.ndarray:
-        """Return points in what :meth:`reach` tells of each dimension."""
-        return (points / self.reach(np.shape(points)[-1])).astype(np.float32)
+        """Return points in their units; what does not matter is 0, whatever it is."""
+        return (points / self._units(np.shape(points)[-1])).astype(np.float32)
 
     def reach(self, goal_dim: int) -> np.ndarray:
-        """Return how far off a goal is, in each dimension alone, that is no longer reached, from 0 on and to a factor of two.
+        """Return the units of all dimensions, 0 of those that do not matter."""
+        units = self._units(goal_dim)
+        return np.where(np.isfinite(units), units, 0.0)
 
-        A dimension in which that is never so is taken as it is.
+    def _units(self, goal_dim: int) -> np.ndarray:
+        """Return how far off a goal is that is no longer reached, in each dimension alone, from 0 on, to a factor of two.
+
+        It is infinite where the function does not look, and 1 where a goal is always reached all the same.
         """
-        if goal_dim not in self._reach:
+        if goal_dim not in self._known_units:
             far = 2.0 ** np.arange(-30.0, 31.0)
             goals = far[:, None, None] * np.eye(goal_dim)
-            missed = self.distance(np.zeros_like(goals), goals) > self.radius  # (distances, dimensions)
-            self._reach[goal_dim] = np.where(missed.any(axis=0), far[missed.argmax(axis=0)], 1.0)
-        return self._reach[goal_dim]
+            away = self.distance(np.zeros_like(goals), goals)  # (distances, dimensions)
+            missed = away > self.radius
+            units = np.where(missed.any(axis=0), far[missed.argmax(axis=0)], 1.0)
+            self._known_units[goal_dim] = np.where((away == 0.0).all(axis=0), np.inf, units)
+        return self._known_units[goal_dim]
 
     def get_state(self) -> Any:
         """Return the function."""

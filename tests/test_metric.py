@@ -166,8 +166,11 @@ def test_networks_see_goals_of_a_users_own_metric_in_its_units() -> None:
     units = metric.reach(3)
     for i, radius in enumerate((0.0144, 40.0)):
         assert radius < units[i] <= 2.0 * radius
-    assert units[2] == 1.0  # it does not matter, and is taken as it is
-    np.testing.assert_allclose(metric.embed(np.array([[0.0288, -80.0, 3.0]])), [[0.0288, -80.0, 3.0] / units], rtol=1e-6)
+    assert units[2] == 0.0  # it does not matter
+    np.testing.assert_allclose(metric.embed(np.array([[0.0288, -80.0, 3.0]]))[0, :2], [0.0288 / units[0], -80.0 / units[1]])
+    assert metric.embed(np.array([3.0, 3.0, 3.0]))[2] == 0.0
+    near = as_metric(lambda a, b: np.minimum(np.abs(a - b)[..., 0], 0.9))  # never missed, and yet looked at
+    assert near.reach(1) == 1.0
 
 
 class WithHeading(gym.ObservationWrapper):
