@@ -87,10 +87,12 @@ def command(plan: str) -> str:
 
 def methods(plan: str) -> str:
     """Return a table of all methods of a plan on all its tasks."""
-    head = ("Task", "Steps", "Method", "Success", "Difference to `skill-graph`", "Steps to goals", "Over ours", "Seeds")
+    rows = summary(plan)
+    first = f"`{rows[0]['method']}`"
+    head = ("Task", "Steps", "Method", "Success", f"Difference to {first}", "Steps to goals", f"Over {first}", "Seeds")
     lines = [
         (
-            TASKS[row["environment"]],
+            {**OGBENCH, **TASKS}[row["environment"]],
             str(row["steps"]),
             f"`{row['method']}`",
             rate(row),
@@ -99,7 +101,7 @@ def methods(plan: str) -> str:
             number(row["steps_over_first"]),
             str(row["seeds"]),
         )
-        for row in summary(plan)
+        for row in rows
     ]
     return table(head, lines)
 

@@ -204,6 +204,16 @@ def test_continuation_from_a_state_is_exact(env_id: str) -> None:
 # -- teleporters ------------------------------------------------------------------------------------------------------
 
 
+def test_an_ant_tells_when_it_is_on_its_back() -> None:
+    env: Any = gym.make("SkillGraph/OGBenchAntMedium-v0")
+    env.reset(seed=0)
+    still = np.zeros(8, dtype=np.float32)
+    assert not env.step(still)[-1].get("stuck")
+    env.unwrapped.maze.data.qpos[3:7] = (0.0, 1.0, 0.0, 0.0)  # half a turn about its length
+    assert env.step(still)[-1]["stuck"]
+    env.close()
+
+
 def test_a_teleport_is_seen_on_the_step_that_it_happens() -> None:
     env = make(TELEPORT)
     env.reset(seed=0)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from sb3_skillgraph.envs.maze_geometry import MazeGeometry
 from sb3_skillgraph.envs.mujoco_mazes import private_temporary_directory
 from sb3_skillgraph.envs.task import GoalTask, Observation
+from sb3_skillgraph.envs.wrappers import lies_down
 
 _FULL_STATE = mujoco.mjtState.mjSTATE_INTEGRATION
 #: By kind of body: numbers of the observation that are its position, the view of it, distance kept from walls.
@@ -26,7 +27,8 @@ class OGBenchMazeEnv(GoalTask):
     position (x, y) as the achieved goal, a success radius, starts and goals of one's choice. Every episode begins in the
     cell (1, 1), where OGBench's first task begins, unless ``reset`` or ``random_start`` says otherwise. Where a teleporter
     takes the body is seen on the step that it happens (OGBench shows the old position once more), and is drawn from the
-    environment's own generator (OGBench draws from NumPy's global one).
+    environment's own generator (OGBench draws from NumPy's global one). ``info["stuck"]`` is there, and True, once an ant has
+    fallen on its back.
 
     :param name: OGBench's id of the environment
     :param render_mode: None or one of ``metadata["render_modes"]``
@@ -112,6 +114,11 @@ class OGBenchMazeEnv(GoalTask):
         position = np.array(self.maze.get_xy(), dtype=np.float64)
         body = np.array(self.maze.get_ob(), dtype=np.float64)[self._skip :]
         return {"observation": body, "achieved_goal": position, "desired_goal": np.array(self.goal, dtype=np.float64)}
+
+    def _make_info(self, success: bool) -> dict[str, Any]:
+        info = super()._make_info(success)
+        fallen = self.option_view == "placed_body" and lies_down(self.maze.data.qpos[3:7])
+        return {**info, "stuck": True} if fallen else info
 
     def _get_body_state(self) -> NDArray[np.float64]:
         state = np.empty(mujoco.mj_stateSize(self.maze.model, _FULL_STATE))
