@@ -38,10 +38,16 @@ class GoalSpec(NamedTuple):
         """
         wanted = "a Dict observation space with Box entries 'observation', 'achieved_goal' and 'desired_goal'"
         if not isinstance(observation_space, spaces.Dict) or any(key not in observation_space.spaces for key in KEYS):
-            raise ValueError(f"SkillGraphAgent needs a goal environment ({wanted}), not {observation_space}.")
+            raise ValueError(
+                f"SkillGraphAgent needs a goal environment ({wanted}), not {observation_space}. Where observations are a Box, "
+                "sb3_skillgraph.envs.PursueGoals makes one."
+            )
         boxes = [observation_space[key] for key in KEYS]
         if not all(isinstance(box, spaces.Box) for box in observation_space.spaces.values()):
-            raise ValueError(f"SkillGraphAgent needs {wanted}; this environment has {observation_space}.")
+            raise ValueError(
+                f"SkillGraphAgent needs {wanted}; this environment has {observation_space}. Where goals are Dicts, "
+                "sb3_skillgraph.envs.FlattenGoals makes vectors of them."
+            )
         shapes = [box.shape for box in boxes]
         if shapes[1] != shapes[2] or shapes[1] is None or len(shapes[1]) != 1 or shapes[1][0] == 0:
             raise ValueError(

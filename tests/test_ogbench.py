@@ -11,7 +11,9 @@ import pytest
 from conftest import differences, new_agent
 from stable_baselines3.common.env_checker import check_env
 
-import sb3_skillgraph.envs  # noqa: F401 - registers the environments
+from sb3_skillgraph.envs import find
+from sb3_skillgraph.envs.ogbench_mazes import OGBenchMazeEnv
+from sb3_skillgraph.hyperparams import load_hyperparams, make_recommended
 
 pytest.importorskip("ogbench")
 pytestmark = pytest.mark.mujoco
@@ -93,6 +95,19 @@ def test_walls_and_tasks_are_those_of_ogbench(env_id: str) -> None:
         np.testing.assert_array_equal(ends, [task["init_xy"], task["goal_xy"]])
         assert geometry.is_free(ends, env.body_radius).all()
         assert np.isfinite(geometry.shortest_path_length(*ends)) or env_id == TELEPORT
+
+
+@pytest.mark.parametrize(
+    ("env_id", "ours"), [("pointmaze-teleport-v0", TELEPORT), ("ogbench:antmaze-medium-v0", ANT)], ids=["name", "package"]
+)
+def test_ogbenchs_own_names_stand_for_the_adapter(env_id: str, ours: str) -> None:
+    find(env_id)
+    env, known = make_recommended(env_id, {}), gym.make(ours)
+    assert isinstance(env, OGBenchMazeEnv)
+    settings, wanted = load_hyperparams(env_id), load_hyperparams(ours)
+    assert settings == wanted
+    assert same(env.reset(seed=3)[0], known.reset(seed=3)[0])
+    assert same(env.step(env.action_space.high), known.step(env.action_space.high))
 
 
 @pytest.mark.parametrize("name", ["humanoidmaze-medium-v0", "antsoccer-arena-v0", "cube-single-v0", ""])

@@ -66,9 +66,10 @@ def register() -> None:
 
 
 def find(env_id: str) -> None:
-    """See to it that an environment is registered: import the package that its id names, or else gymnasium-robotics.
+    """See to it that an environment is registered: import the package that its id names, else gymnasium-robotics or OGBench.
 
-    :param env_id: ``"package:Name-v0"``, or the id of an environment that is registered, or of gymnasium-robotics
+    :param env_id: ``"package:Name-v0"``, or the id of an environment that is registered, of gymnasium-robotics, or of a maze
+        of OGBench
     :raises ImportError: if the package cannot be imported
     :raises gymnasium.error.Error: if there is no such environment
     """
@@ -81,6 +82,8 @@ def find(env_id: str) -> None:
         import gymnasium_robotics
 
         gym.register_envs(gymnasium_robotics)
+        if name.startswith(("pointmaze-", "antmaze-")):
+            importlib.import_module("ogbench")
     gym.spec(name)
 
 

@@ -20,6 +20,16 @@ _FULL_STATE = mujoco.mjtState.mjSTATE_INTEGRATION
 _BODIES: dict[str, tuple[int, str, float]] = {"point": (0, "relative", 0.7), "ant": (2, "placed_body", 0.9)}
 
 
+def adapted(env: gym.Env) -> "OGBenchMazeEnv":
+    """Return the goal environment that there is in place of OGBench's own, which is closed.
+
+    :param env: ``pointmaze-*`` or ``antmaze-*`` as OGBench makes it
+    """
+    assert env.spec is not None
+    env.close()
+    return OGBenchMazeEnv(env.spec.id, env.render_mode)
+
+
 class OGBenchMazeEnv(GoalTask):
     """A maze of OGBench: ``pointmaze-giant-v0``, ``antmaze-teleport-v0``, ...
 

@@ -38,7 +38,7 @@ from sb3_skillgraph.experiments.run_folder import (
     take_checkpoint,
 )
 from sb3_skillgraph.files import replaced, write_text
-from sb3_skillgraph.hyperparams import recommended_wrapper
+from sb3_skillgraph.hyperparams import make_recommended
 from sb3_skillgraph.persistence import kept_by_name
 from sb3_skillgraph.plotting import snapshot
 from sb3_skillgraph.rules import PaperRules
@@ -81,7 +81,7 @@ def train(
     """
     config = dict(env=env_id, env_kwargs=env_kwargs, steps=steps, seed=seed, n_envs=n_envs, arguments=arguments)
     with for_people():
-        env = make_vec_env(env_id, n_envs, env_kwargs=env_kwargs, wrapper_class=recommended_wrapper(env_id))
+        env = make_vec_env(lambda: make_recommended(env_id, env_kwargs), n_envs)
     try:
         with for_people():  # who mistypes something leaves no folder
             agent = SkillGraphAgent(env=env, seed=seed, **{"device": device, **arguments})

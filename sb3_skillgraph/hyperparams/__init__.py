@@ -4,7 +4,7 @@ import difflib
 import fnmatch
 import importlib
 import inspect
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,7 @@ import yaml
 
 from sb3_skillgraph.agent import SkillGraphAgent
 from sb3_skillgraph.arguments import OPTION_CLASSES
+from sb3_skillgraph.goal_env import GoalSpec
 from sb3_skillgraph.rules import PAPER
 
 FILE = Path(__file__).parent / "skillgraph.yml"
@@ -57,33 +58,29 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 def _entry_of(env_id: str, entries: Iterable[str]) -> str:
-    """Return the entry that is for an environment: its own, else the first whose star stands for the rest of its name."""
-    fitting = (entry for entry in entries if fnmatch.fnmatchcase(env_id, str(entry)))
-    return env_id if env_id in entries else next(fitting, env_id)
+    """Return the entry that is for an environment: its own, else the first whose star stands for the rest of its name.
 
-
-def recommended_wrapper(env_id: str) -> Callable[[gym.Env], gym.Env] | None:
-    """Return the wrapper that is recommended for an environment; None for most.
-
-    :param env_id: id of the environment
+    The package that its id may begin with does not count.
     """
-    document = _read(FILE)
-    name = (document.get(_entry_of(env_id, document)) or {}).get(WRAPPER)
-    if name is None:
-        return None
-    package, _, wrapper = name.rpartition(".")
-    found: Callable[[gym.Env], gym.Env] = getattr(importlib.import_module(package), wrapper)
-    return found
+    name = env_id.rpartition(":")[2]
+    fitting = (entry for entry in entries if fnmatch.fnmatchcase(name, str(entry)))
+    return name if name in entries else next(fitting, name)
 
 
 def make_recommended(env_id: str, env_kwargs: dict[str, Any]) -> gym.Env:
-    """Make an environment, with the wrapper that is recommended for it.
+    """Make a goal environment, with the wrapper that is recommended for it.
 
     :param env_id: its id
     :param env_kwargs: its keyword arguments
+    :raises ValueError: if it is none
     """
-    env, wrapper = gym.make(env_id, **env_kwargs), recommended_wrapper(env_id)
-    return env if wrapper is None else wrapper(env)
+    env, document = gym.make(env_id, **env_kwargs), _read(FILE)
+    name = (document.get(_entry_of(env_id, document)) or {}).get(WRAPPER)
+    if name is not None:
+        package, _, wrapper = name.rpartition(".")
+        env = getattr(importlib.import_module(package), wrapper)(env)
+    GoalSpec.of(env.observation_space, env.action_space)
+    return env
 
 
 def check_hyperparams(values: dict[str, Any], origin: str) -> dict[str, Any]:
