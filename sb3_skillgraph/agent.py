@@ -322,13 +322,17 @@ class SkillGraphAgent(OffPolicyAlgorithm):
     ) -> None:
         """Store the step once, and let everything learn from it."""
         assert isinstance(new_obs, dict)
+        # An end for good is worth nothing more, a time limit ends only the episode, and who is stuck is given up here
         stuck = np.array([bool(info.get("stuck")) for info in infos])
         terminated = self.episodes.terminated(dones, infos)
         new_obs = self.episodes.start_over(new_obs, dones, stuck, infos)
+        # A VecEnv shows how the next episode begins where one has ended: what is stored is what the step led to
         reached = with_terminal(new_obs, dones, infos)
+        # Nothing is stored of a step that cannot be learned from
         check_finite(new_obs, self.num_timesteps)
         if reached is not new_obs:
             check_finite(reached, self.num_timesteps)
+        # Ctrl-C waits until all that learns from the step has done so
         with self._interrupts:
             observations = {key: rows(reached, key) for key in ("observation", "achieved_goal")}
             self.parts.rollout.observe(observations, terminated, dones, stuck)
@@ -347,9 +351,11 @@ class SkillGraphAgent(OffPolicyAlgorithm):
             return  # loaded without its replay buffer: first gather some experience
         if self.gradient_steps > 0:
             gradient_steps *= self.n_envs  # as many for a step, however many environments take it at once
+        # The walker learns from everything, a skill as much as it has run
         for option, n_updates in self.parts.learners(gradient_steps):
             if n_updates > 0 and option.replay.size() >= batch_size:
                 self._train(option.learner, n_updates, batch_size)
+        # What predict acts by follows
         self.parts.learned(gradient_steps)
         self._n_updates += gradient_steps
         self.graph.now = float(self._n_updates)  # records age as the walker learns
@@ -418,6 +424,7 @@ class SkillGraphAgent(OffPolicyAlgorithm):
         running = self._running_state(len(batch["achieved_goal"]), state)
         if episode_start is not None and np.any(episode_start):
             running = running.begun_anew(np.asarray(episode_start, dtype=bool))
+        # First end what has arrived or timed out, then begin the first option of a plan where none runs, and act
         running, runs = self.parts.runner.advance(running, batch["achieved_goal"])
         scaled, running = self.parts.runner.act(batch, batch["desired_goal"], running)
         actions = self.parts.unscale(scaled)

@@ -53,6 +53,7 @@ class ChoiceModel:
 
     def _gather(self) -> Choices:
         edges, aging, kinds = self.graph.edges, self.graph.aging(), self.kinds()
+        # What has been tried tells by its own runs, what has not by what others of its kind and place have done
         successes, failures = edges.successes * aging, edges.failures * aging
         hasty = self.model.is_hasty(kinds)
         guess = self._with_kin(self.model.success(kinds), hasty, successes, successes + failures)
@@ -77,6 +78,7 @@ class ChoiceModel:
         :param runs: weight of all of its runs
         """
         edges, n_events = self.graph.edges, len(self.graph.events)
+        # The guess counts for as many runs as it does everywhere, kin for a share of theirs, no run for itself
         total, weight = GUESS_RUNS * guess, np.full(len(guess), GUESS_RUNS)
         for ends in (edges.source + n_events * hasty, edges.target + n_events * hasty):
             kin_hits = np.bincount(ends, hits, 2 * n_events)[ends] - hits
@@ -246,12 +248,14 @@ class ChoiceModel:
             near = np.argsort(graph.distances(start.point), kind="stable")[:NEAR_EVENTS]
             nowhere = np.full(len(near), NOWHERE)
             parts.append(self._guessed(near, nowhere, near, start.point, graph.centers[near], np.zeros(len(near)), runs))
+        # There always is a way: at worst the walk straight to the goal
         targets = np.concatenate([part.target for part in parts])
         if n_events not in targets:
             direct = self._guessed(here, event, n_events, start.point, goal[None], np.zeros(1), runs)
             # One that would be longer than any walk in the graph is begun only where there is nothing else to do.
             if direct.steps[0] <= graph.walk_steps or not len(targets) or start.towards == n_events:
                 parts.append(direct)
+        # What runs already is a choice, too, even where nothing else would lead there
         if start.towards not in (NOWHERE, n_events) and start.towards not in targets:
             end = graph.centers[[start.towards]]
             parts.append(self._guessed(here, event, start.towards, start.point, end, np.ones(1), runs))

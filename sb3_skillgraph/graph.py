@@ -124,6 +124,7 @@ class SkillGraph:
         :return: the new index of every old event
         """
         self.cover_radius *= GROWTH
+        # Salient events first, then old ones: each stays unless one that stays lies too near
         order = sorted(range(len(self.events)), key=lambda i: (not self.events[i].salient, i))
         kept: list[int] = []
         for i in order:
@@ -181,6 +182,7 @@ class SkillGraph:
         :param steps: environment steps in between
         """
         edges = self.edges
+        # Most ways can be gone back: a guess, which the model of walks has learned how much to trust
         there, back = edges.add(source, target, self.now), edges.add(target, source, self.now)
         if edges.forward[there] == 0:
             edges.crossing_steps[there] = steps

@@ -198,6 +198,7 @@ class Planner:
         n_events = len(self.graph.events)
         n_vertices = n_events + 3
         known, walks = self._worked_out(stance), self.choice_model.walks()
+        # Edges that the episode has shown more of stand among its own choices, and not among those of training
         replaced, episode = self.choice_model.of_episode(start, goal, runs, everywhere)
         constant = known.linear.constant
         if len(replaced):
@@ -207,6 +208,7 @@ class Planner:
         values[n_events] = 0.0
         for _ in range(MAX_SWEEPS):
             before = values
+            # One sweep: every vertex takes its cheapest choice, by the values of the last sweep
             values = np.full(n_vertices, self.lost)
             costs, episode_costs = constant + known.linear.matrix @ before, linear.costs(before)
             if len(known.first):
@@ -215,6 +217,7 @@ class Planner:
             values[n_events] = 0.0
             if (before - values).max() < PRECISION:
                 break
+        # Back into the order of the graph's edges, as whoever reads the solution knows them
         in_order = np.empty_like(costs)
         in_order[known.order] = np.minimum(costs, self.lost)
         in_order[replaced] = np.inf
@@ -252,6 +255,7 @@ class Planner:
             named.add(target)
             if target == solution.goal:
                 return [*steps, (target, target)]
+            # Of the places where the option ends, the likeliest that is nearer to the goal
             landing, share = row.landings()
             success = row.success(EXPECTED)
             ends = np.append(landing[0], target)
@@ -279,6 +283,7 @@ class Planner:
         best = solution.best(first)
         policy = solution.choices.take(best[best >= 0])
         policy = policy.take(self._met(policy, solution.start))
+        # By bins of time: who fails and tries again arrives later, perhaps too late
         curve = np.mean([self._arrival(policy, opinion, solution, remaining) for opinion in OPINIONS], axis=0)
         probability = float(curve[-1])
         if probability < LEAST:

@@ -87,6 +87,7 @@ class Runner:
         for i, option in enumerate(state.option.tolist()):
             if not option:
                 continue
+            # Being stuck ends a run whatever else happens; arriving counts even at the last step
             lost = stuck is not None and bool(stuck[i])
             arrived = not lost and self._has_arrived(option, points[i], state.aim[i])
             # Its event may have been merged with others since.
@@ -137,6 +138,7 @@ class Runner:
         state = state.having_seen(np.concatenate([observation["observation"], points], axis=1, dtype=np.float64))
         if self.rules is None:  # the paper's know no such thing
             state = state._replace(timeout=np.where(state.still >= STILL_STEPS, 0.0, state.timeout))
+        # Where no option runs, the first of the plan begins
         idle = np.flatnonzero(state.option == "").tolist()
         if idle:
             state = state.copy()
@@ -144,6 +146,7 @@ class Runner:
             chosen = (choose or self.choose)(state, i, points[i], goals[i], stance)
             state.option[i], state.began[i], state.aim[i], state.timeout[i] = chosen
             state.steps[i] = state.still[i] = 0
+        # All walks act by one network, in one pass for all environments; skills by their own
         seen = self.view(observation["observation"], points, state.aim)
         actions = self.actor.act(seen)
         for i, option in enumerate(state.option.tolist() if self.skills else ()):

@@ -142,6 +142,7 @@ class WalkModel:
         self.version += 1
 
     def _fit_success(self, kind: Kind, successes: np.ndarray, failures: np.ndarray) -> None:
+        # Standardised, so that the ridge weighs all features alike
         features, weight = kind.features(self.fastest), successes + failures
         self.mean = np.average(features, axis=0, weights=weight)
         self.scale = np.sqrt(np.average((features - self.mean) ** 2, axis=0, weights=weight))
@@ -169,6 +170,7 @@ class WalkModel:
         if np.count_nonzero(long) >= ENOUGH_LONG:
             pace = taken[long] / (distance[long] - 1.0)
         self.fastest = float(np.quantile(pace, FASTEST))
+        # Least squares, each walk weighted by its successful runs
         root = np.sqrt(successes[reached])
         ridge = np.sqrt(RIDGE) * np.eye(len(self.pace))
         left = np.concatenate([_pace_features(kind)[reached] * root[:, None], ridge])

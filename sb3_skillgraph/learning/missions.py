@@ -151,6 +151,7 @@ class Missions(Agenda):
         mission = self.current[env]
         assert mission is not None
         was_exploring = mission.exploring
+        # Failed runs on the way are counted: who cannot get there does something else
         if run is not None:
             mission.n_failures += not run.success
             if mission.exploring and run.stood_still:
@@ -201,10 +202,12 @@ class Missions(Agenda):
 
         Of some proposals it is the one whose event has been visited least.
         """
+        # Travel to where the graph ends before a proposed point, and explore from there
         proposals = [self.salience.propose(self.rng) for _ in range(N_PROPOSALS)]
         points = [proposal for proposal in proposals if proposal is not None]
         if not points:
             return self._random_walk(point)
+        # Of several, the one that lies where the agent has been least: there is most to find
         nearest = [int(self.graph.distances(proposal).argmin()) for proposal in points]
         rarest = int(np.argmin(self.graph.visits[nearest]))
         return self._beyond(nearest[rarest], points[rarest])

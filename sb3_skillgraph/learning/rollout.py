@@ -103,9 +103,12 @@ class Rollout:
         :param noise: to add; None for Gaussian noise
         :return: scaled actions, shape ``(n_envs, action_dim)``
         """
+        # Should the step never be stored, it is taken back
         rng_state = self.rng.bit_generator.state
         points = observation["achieved_goal"]
         missions = [self.missions.of(i, point, warm_up) for i, point in enumerate(points)]
+        # Who explores goes straight for a point that no option leads to; the others follow plans to their missions' goals,
+        # which count on more than is sure, so that what is unknown gets tried
         state = self._explorers(self.state, missions)
         goals = np.stack([mission.goal for mission in missions])
         scaled, state = self.runner.act(observation, goals, state, OPTIMISTIC)
@@ -141,6 +144,7 @@ class Rollout:
         noisy = scaled + added
         held, hold_left = self.held, self.hold_left.copy()
         for i, mission in enumerate(missions):
+            # As in predict: only such runs go into records
             if mission.clean and not mission.random_walk:
                 hold_left[i] = 0
                 continue
@@ -167,6 +171,7 @@ class Rollout:
         step = self.pending
         assert step is not None
         points = reached["achieved_goal"]
+        # Each transition is in the store once, with the point that its option aimed at
         rows = self.store.add(
             step.observation["observation"],
             step.observation["achieved_goal"],
@@ -179,6 +184,7 @@ class Rollout:
             stuck,
         )
         self.held, self.hold_left, self.pending = step.held, step.hold_left, None
+        # A skill learns from its own runs more than from others
         skills = self.runner.skills
         for i, option in enumerate(step.state.option.tolist() if skills else ()):
             if option in skills:
@@ -188,6 +194,7 @@ class Rollout:
         if self.scale is not None and self.scale.observe(step.observation["achieved_goal"], points, dones):
             self.scale.tell()
             self.scale = None
+        # Which options have begun with this step, and which have ended
         for i in np.flatnonzero(step.state.steps == 1).tolist():
             self.witness.began(i, step.observation["achieved_goal"][i])
         self.state, runs = self.runner.advance(step.state, points, stuck)
@@ -199,10 +206,12 @@ class Rollout:
                 self.missions.discovered(i)
             run, mission = by_env.get(i), self.missions.current[i]
             assert mission is not None
+            # A random walk is no run of anything; other runs tell what options do
             if run is not None and not mission.random_walk:
                 self.witness.ended(run, clean=mission.clean)
             if run is not None and run.success and mission.exploring and not mission.random_walk:
                 self._salient(point)
+            # Who has something else to do now begins it without an option
             over[i] = self.missions.observe(i, point, run, bool(dones[i]))
             self.n_stuck += bool(stuck[i])
         self.hold_left = np.where(dones, 0, self.hold_left)

@@ -137,6 +137,7 @@ class Witness:
     def _left(self, env: int) -> None:
         """A stay is over: every event that was passed shortly before has been crossed from."""
         *earlier, last = self._stays[env]
+        # The steps of a crossing are those between the centres, as near as the trajectory came to them
         recent = [stay for stay in earlier if last.reached - stay.left <= self.graph.walk_steps]
         seen = set()
         for stay in reversed(recent):
@@ -158,6 +159,7 @@ class Witness:
         :return: its index
         """
         while len(self.graph.events) >= self.graph.max_events:
+            # Trajectories under way are in the events that others were merged into; the point may be in one, too, now
             new_index = self.graph.coarsen()
             for stays in self._stays:
                 for stay in stays:
@@ -203,11 +205,13 @@ class Witness:
         """Learn what to expect of untried walks from all runs so far."""
         graph, edges, model = self.graph, self.graph.edges, self.choice_model.model
         aging = graph.aging()
+        # Runs of walks to events are in the graph; those to goals, which no edge keeps, are kept here
         samples = self._samples[: min(self._n_samples, N_SAMPLES)]
         distance, at_home, success, steps = samples[:, :_COLUMNS].T
         kinds = self.choice_model.kinds()
         known = at_home * distance * model.steps_per_radius, at_home, np.zeros(len(samples))
         direct = Kind(distance, *known, samples[:, _COLUMNS:] > 0.0)
+        # What ran long ago, as the walker's training goes, counts less
         model.fit(
             Kind(*(np.concatenate(columns) for columns in zip(kinds, direct, strict=True))),
             np.concatenate([edges.successes * aging, success]),

@@ -161,15 +161,18 @@ class OptionReplay(ReplayBuffer):
             imagined = np.ones(batch_size, dtype=bool)
             imagined[:n_own] = rng.random(n_own) < self.hindsight
         data = store.read(rows)
+        # Each transition has the goal that was pursued, or the one that its option is for now
         goal, next_achieved_goal = data["goal"], data["next_achieved_goal"]
         if self.aim is not None:
             goal[:] = self.aim()
         # What was achieved on the way to getting stuck would make that way look safe: it all came before.
         doomed = store.doomed(rows, self.doomed_steps)
         imagined[:n_own] &= ~doomed[:n_own]
+        # Hindsight: a goal that was achieved later on the same trajectory
         relabelled = imagined & ~doomed
         later = store.future(rows[relabelled], self.horizon, rng)
         goal[relabelled] = store.column("next_achieved_goal", later)
+        # Reward and end follow from the goal, not from what the environment said
         reached, stuck = self.rule.reached(next_achieved_goal, goal, imagined), store.stuck(rows)
         over = reached | stuck | store.terminated(rows)
         rewards = self.rule.reward(reached, over, stuck, data["achieved_goal"], next_achieved_goal, goal)
