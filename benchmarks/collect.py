@@ -14,7 +14,6 @@ import csv
 import functools
 import math
 import pathlib
-import subprocess
 from collections.abc import Iterable, Iterator
 from typing import Any
 
@@ -23,10 +22,9 @@ import numpy as np
 from scipy import stats
 
 from benchmarks.shortest import Shortest
-from sb3_skillgraph import __version__
 from sb3_skillgraph.evaluation import brier_score, calibration
 from sb3_skillgraph.experiments.plan import RunSpec, load_plan
-from sb3_skillgraph.experiments.run_folder import DONE, SECONDS, STEPS, read_json, read_progress
+from sb3_skillgraph.experiments.run_folder import CONFIG, DONE, SECONDS, STEPS, read_json, read_progress
 from sb3_skillgraph.experiments.status import status
 
 RESULTS = pathlib.Path(__file__).parent / "results"
@@ -91,7 +89,8 @@ def rows_of(spec: RunSpec, first: RunSpec, out: pathlib.Path) -> dict[str, list[
     :param first: that of the plan's first method with the same seed
     :param out: folder of all runs
     """
-    version = {"version": __version__, "commit": commit()}
+    versions = read_json(spec.folder(out) / CONFIG)["versions"]
+    version = {"version": versions["sb3_skillgraph"], "commit": versions["commit"]}
     shortest = shortest_of(spec.env_id)
     reference = {steps: test for steps, _, test in tests_of(first, out)} if (first.folder(out) / DONE).exists() else {}
     tables: dict[str, list[Row]] = {name: [] for name in KEYS}
@@ -110,13 +109,6 @@ def rows_of(spec: RunSpec, first: RunSpec, out: pathlib.Path) -> dict[str, list[
         also = described(test, reference.get(spec.steps, test), shortest)
         tables["runs"].append({**key, "method": name, "steps": spec.steps, "seconds": last["seconds"], **also, **version})
     return tables
-
-
-@functools.cache
-def commit() -> str:
-    """Return the commit that is checked out."""
-    command = ["git", "-C", str(RESULTS), "rev-parse", "--short", "HEAD"]
-    return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
 
 
 def read(path: pathlib.Path) -> list[Row]:

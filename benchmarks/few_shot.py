@@ -20,10 +20,11 @@ import numpy as np
 import torch as th
 from joblib import Parallel, delayed
 
-from benchmarks.collect import RESULTS, Row, commit, write
+from benchmarks.collect import RESULTS, Row, write
 from sb3_skillgraph import SkillGraphAgent, __version__
 from sb3_skillgraph.envs import MazeGeometry, MazeMap
 from sb3_skillgraph.evaluation import Predictor, run_pair
+from sb3_skillgraph.experiments.console import commit
 
 ENV = "SkillGraph/PointMaze-v0"
 DOOR = (4, 4)

@@ -25,6 +25,7 @@ from imageio.v3 import imread
 import sb3_skillgraph.envs
 from sb3_skillgraph.cli import main
 from sb3_skillgraph.experiments import RunSpec, compare, figures, learners, load_plan, run, runner, status, testing
+from sb3_skillgraph.experiments.console import commit
 from sb3_skillgraph.experiments.figures import method_curves, practice_curves
 from sb3_skillgraph.experiments.run_folder import checkpoints, read_progress
 from sb3_skillgraph.experiments.summary import estimate, interquartile_mean
@@ -93,7 +94,7 @@ def test_a_run_leaves_everything_and_is_not_done_again(
     assert folder == tmp_path / "toy" / algorithm / "seed0"
     config = json.loads((folder / "config.json").read_text())
     assert config["steps"] == 400
-    assert config["versions"]["sb3_skillgraph"]
+    assert config["versions"]["sb3_skillgraph"] and config["versions"]["commit"] == commit()
     assert [row["time/total_timesteps"] for row in progress(folder)] == ([400] if algorithm == "random_walk" else [200, 400])
     saved = checkpoints(folder)[400]
     assert any(saved.iterdir()) == (algorithm != "random_walk")
@@ -116,6 +117,16 @@ def test_a_run_leaves_everything_and_is_not_done_again(
 
 class Killed(BaseException):
     """What no error handling catches."""
+
+
+def test_the_commit_is_known_in_a_checkout_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    if (Path(__file__).parents[1] / ".git").exists():
+        told = subprocess.run(
+            ["git", "rev-parse", "HEAD"], cwd=Path(__file__).parent, capture_output=True, text=True, check=True
+        )
+        assert commit() and told.stdout.startswith(commit())
+    monkeypatch.setenv("PATH", "")  # there is no git
+    assert commit() == ""
 
 
 def test_a_run_goes_on_where_its_checkpoint_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,9 +1,11 @@
 """What all commands share: errors for people, arguments in YAML, and the versions in use."""
 
 import argparse
+import subprocess
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.metadata import version
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -28,8 +30,19 @@ def for_people() -> Iterator[None]:
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of everything that a run's results may depend on."""
-    return {"sb3_skillgraph": __version__, **{name: version(name) for name in _VERSIONS_OF}}
+    """Return the versions of everything that a run's results may depend on, and the commit, if it is known."""
+    return {"sb3_skillgraph": __version__, "commit": commit(), **{name: version(name) for name in _VERSIONS_OF}}
+
+
+def commit() -> str:
+    """Return the commit that this package was checked out from by git; an empty string for an installed one."""
+    package = Path(__file__).parents[1]
+    for command in (["ls-files", "--error-unmatch", "version.py"], ["rev-parse", "--short", "HEAD"]):
+        try:
+            told = subprocess.run(["git", "-C", str(package), *command], capture_output=True, text=True, check=True)
+        except (OSError, subprocess.CalledProcessError):
+            return ""
+    return told.stdout.strip()
 
 
 def positive(text: str) -> int:
