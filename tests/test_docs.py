@@ -39,3 +39,9 @@ def test_the_examples_in_docstrings_hold(module: str) -> None:
     tested = importlib.import_module(f"sb3_skillgraph.{module}")
     result = doctest.testmod(tested, extraglobs=names, optionflags=doctest.NORMALIZE_WHITESPACE)
     assert result.attempted > 0 and result.failed == 0
+
+
+def test_what_a_package_index_shows_has_no_links_that_die_there() -> None:
+    text = (DOCS / "package.md").read_text()
+    assert not re.findall(r"\]\((?!https?://)[^)]*\)", text)
+    assert "long_description = file: docs/package.md" in (DOCS.parent / "setup.cfg").read_text()
