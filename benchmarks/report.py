@@ -43,6 +43,7 @@ OGBENCH = {
     "teleport": "`pointmaze-teleport-v0`",
     "giant-100": "giant, episodes of 100 steps from anywhere",
     "giant-200": "giant, episodes of 200 steps from anywhere",
+    "ant-medium": "`antmaze-medium-v0`",
 }
 #: Success of the best published method on OGBench's tasks, learned offline from its data.
 PUBLISHED = {"medium": 0.91, "large": 0.88, "giant": 0.92, "teleport": 0.57}
@@ -121,9 +122,9 @@ def curves_of(plan: str, method: str) -> str:
     return "\n".join(lines)
 
 
-def ogbench() -> str:
-    """Return the table of OGBench's mazes."""
-    rows = summary("ogbench")
+def ogbench(plan: str) -> str:
+    """Return a table of OGBench's mazes."""
+    rows = summary(plan)
     head = ("Maze", "Steps", "Method", "Official tasks", "Best published", "Random pairs", "Times the shortest", "Seeds")
     lines = [
         (
