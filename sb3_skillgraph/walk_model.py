@@ -12,6 +12,8 @@ GUESS_RUNS = 4.0
 RIDGE = 3.0
 #: Success of any walk before there are runs to learn from: of a policy that has hardly been trained.
 FIRST_GUESS = 0.25
+#: Logit that success has at most, either way: nothing is sure of walks unlike any that was tried.
+MOST_LOGIT = 30.0
 #: A crossing is hasty that was so many times faster than the fastest walks, which are this quantile of all that succeed.
 HASTY, FASTEST = 1.5, 0.1
 #: Event radii from which on a walk is long: a run ends a radius before the centre, which is much of a short walk. Speed is
@@ -105,7 +107,8 @@ class WalkModel:
     def success(self, kind: Kind) -> np.ndarray:
         """Return the success rates to expect, shape ``(n,)``."""
         standardised = (kind.features(self.fastest) - self.mean) / self.scale
-        return expit(standardised @ self.coefficients + self.intercept)
+        logits = standardised @ self.coefficients + self.intercept
+        return expit(np.clip(logits, -MOST_LOGIT, MOST_LOGIT))
 
     def is_hasty(self, kind: Kind) -> np.ndarray:
         """Tell which walks would have to be faster than any, shape ``(n,)``."""
