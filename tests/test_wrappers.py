@@ -12,7 +12,7 @@ from gymnasium.wrappers import TransformAction
 import sb3_skillgraph.envs.mujoco_mazes  # noqa: F401 (imports gymnasium-robotics, which registers its ants)
 from sb3_skillgraph import SkillGraphAgent, evaluate_pairs
 from sb3_skillgraph.envs import AntRecipe, FlattenGoals, HoldAction, PursueGoals, TellStuck, on_its_back
-from sb3_skillgraph.hyperparams import load_hyperparams, make_recommended
+from sb3_skillgraph.hyperparams import load_hyperparams, make_recommended, recommended_wrapper
 from sb3_skillgraph.metric import Ball
 
 
@@ -111,6 +111,7 @@ def test_the_recipe_for_ants_is_taken_by_name(robotics_ant: gym.Env) -> None:
     settings = load_hyperparams("AntMaze_UMaze-v5")
     assert settings == load_hyperparams("SkillGraph/AntUMaze-v0") and "env_wrapper" not in settings
     assert settings == load_hyperparams("AntMaze_Large_Diverse_GR-v4") == load_hyperparams("any_package:AntMaze_Own-v7")
+    assert recommended_wrapper("PointMaze_UMaze-v3") is None
     # It is what the wrappers make of it one by one.
     action = np.linspace(-1.0, 1.0, 8, dtype=np.float32)
     for each in (env, robotics_ant, gym.make(env.spec)):

@@ -8,7 +8,7 @@ import yaml
 from conftest import TOY
 
 from sb3_skillgraph import SkillGraphAgent, zoo
-from sb3_skillgraph.hyperparams import load_hyperparams
+from sb3_skillgraph.hyperparams import load_hyperparams, recommended_wrapper
 
 pytestmark = pytest.mark.filterwarnings("ignore")
 FOLDER = "dsg/SkillGraph-ToyMaze-v0_1"
@@ -41,6 +41,7 @@ def test_the_zoo_trains_goes_on_enjoys_and_tunes(
 def test_the_zoos_hyperparameters_are_those_of_the_command_line() -> None:
     for env_id, entry in zoo.read_hyperparams().items():
         if env_id != "default":
+            assert ("env_wrapper" in entry) == (recommended_wrapper(env_id) is not None)
             entry.pop("env_wrapper", None)  # the zoo puts it around by itself
             ours = load_hyperparams(env_id)
             assert entry.keys() == ours.keys()

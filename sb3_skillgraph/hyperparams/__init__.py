@@ -4,7 +4,7 @@ import difflib
 import fnmatch
 import importlib
 import inspect
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -67,6 +67,20 @@ def _entry_of(env_id: str, entries: Iterable[str]) -> str:
     return name if name in entries else next(fitting, name)
 
 
+def recommended_wrapper(env_id: str) -> Callable[[gym.Env], gym.Env] | None:
+    """Return the wrapper that is recommended for an environment; None for most.
+
+    :param env_id: id of the environment
+    """
+    document = _read(FILE)
+    name = (document.get(_entry_of(env_id, document)) or {}).get(WRAPPER)
+    if name is None:
+        return None
+    package, _, wrapper = name.rpartition(".")
+    found: Callable[[gym.Env], gym.Env] = getattr(importlib.import_module(package), wrapper)
+    return found
+
+
 def make_recommended(env_id: str, env_kwargs: dict[str, Any]) -> gym.Env:
     """Make a goal environment, with the wrapper that is recommended for it.
 
@@ -74,11 +88,8 @@ def make_recommended(env_id: str, env_kwargs: dict[str, Any]) -> gym.Env:
     :param env_kwargs: its keyword arguments
     :raises ValueError: if it is none
     """
-    env, document = gym.make(env_id, **env_kwargs), _read(FILE)
-    name = (document.get(_entry_of(env_id, document)) or {}).get(WRAPPER)
-    if name is not None:
-        package, _, wrapper = name.rpartition(".")
-        env = getattr(importlib.import_module(package), wrapper)(env)
+    env, wrapper = gym.make(env_id, **env_kwargs), recommended_wrapper(env_id)
+    env = env if wrapper is None else wrapper(env)
     GoalSpec.of(env.observation_space, env.action_space)
     return env
 
