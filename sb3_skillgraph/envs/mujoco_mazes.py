@@ -212,10 +212,8 @@ class AntMazeEnv(MujocoMazeTask, ant_maze_v5.AntMazeEnv):
     def _observe(self) -> Observation:
         return self._get_obs(self.ant_env._get_obs())
 
-    def _make_info(self, success: bool) -> dict[str, Any]:
-        info = super()._make_info(success)
-        fallen = lies_down(self.ant_env.data.qpos[3:7])
-        return {**info, "stuck": True} if fallen and self.tell_stuck else info
+    def _is_stuck(self) -> bool:
+        return self.tell_stuck and lies_down(self.ant_env.data.qpos[3:7])
 
 
 def make_geometry(maze_map: MazeMap | None, cell_size: float) -> MazeGeometry:

@@ -125,10 +125,8 @@ class OGBenchMazeEnv(GoalTask):
         body = np.array(self.maze.get_ob(), dtype=np.float64)[self._skip :]
         return {"observation": body, "achieved_goal": position, "desired_goal": np.array(self.goal, dtype=np.float64)}
 
-    def _make_info(self, success: bool) -> dict[str, Any]:
-        info = super()._make_info(success)
-        fallen = self.option_view == "placed_body" and lies_down(self.maze.data.qpos[3:7])
-        return {**info, "stuck": True} if fallen else info
+    def _is_stuck(self) -> bool:
+        return self.option_view == "placed_body" and lies_down(self.maze.data.qpos[3:7])
 
     def _get_body_state(self) -> NDArray[np.float64]:
         state = np.empty(mujoco.mj_stateSize(self.maze.model, _FULL_STATE))

@@ -183,7 +183,12 @@ class GoalTask(gym.Env[Any, NDArray[np.float32]]):
 
     def _make_info(self, success: bool) -> dict[str, Any]:
         self._has_succeeded = self._has_succeeded or success
-        return {"success": success, "is_success": self._has_succeeded}
+        info = {"success": success, "is_success": self._has_succeeded}
+        return {**info, "stuck": True} if self._is_stuck() else info
+
+    def _is_stuck(self) -> bool:
+        """Tell whether the body can do nothing any more."""
+        return False
 
     def _check_options(self, options: dict[str, Any]) -> dict[str, NDArray[np.float64]]:
         margins = {"start": self.start_margin, "goal": 0.0}
