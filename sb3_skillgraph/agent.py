@@ -88,10 +88,11 @@ class SkillGraphAgent(OffPolicyAlgorithm):
         Fiedler vector) or an object with ``propose(rng)`` [3.2.1]
     :param exploration_steps: environment steps for which an exploration goes on without finding anything new
     :param explore_beyond: event radii that an exploration towards a point goes on past it
-    :param random_action_prob: share of the steps on the way that are random
     :param hindsight: share of sampled transitions relabelled with a goal achieved later
     :param goal_tolerance: how near to its goal the walker must learn to come, in event radii, 1 at most
     :param shaping: reward for every event radius of distance gained, beside -1 a step; 0 for none [2.1]
+    :param skills: when a walk gets a network of its own: ``"where_needed"``, where walks keep failing, ``"always"`` or
+        ``"never"`` (see :mod:`~sb3_skillgraph.learning.growth`) [2.2]
     :param rules: the paper's rules in place of the graph of walks: with ``**PAPER`` the paper as written; None for the default
     :raises ValueError: if the environment is no goal environment with Box actions, or an argument is out of range
     """
@@ -128,10 +129,10 @@ class SkillGraphAgent(OffPolicyAlgorithm):
         salience: Literal["frontier", "rrt", "dco"] | Salience = "frontier",
         exploration_steps: int = 100,
         explore_beyond: float = 0.0,
-        random_action_prob: float = 0.1,
         hindsight: float = 0.8,
         goal_tolerance: float = 0.5,
         shaping: float = 0.0,
+        skills: Literal["where_needed", "always", "never"] = "never",
         rules: PaperRules | None = None,
     ) -> None:
         # The keyword arguments as given: what is saved, and what load() builds the agent from.

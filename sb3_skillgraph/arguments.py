@@ -27,6 +27,7 @@ NET_ARCH = [128, 128]  # of the walker's networks
 SATURATION_PENALTY = 1e-4
 #: Environment steps within which a goal is to be reached, where the environment names no time limit.
 HORIZON = 1_000
+SKILLS = ("where_needed", "always", "never")  # when walks get a network of their own
 OPTION_CLASSES: dict[str, type[OffPolicyAlgorithm]] = {cls.__name__: cls for cls in (OptionDDPG, OptionTD3, DDPG, TD3, SAC)}
 
 
@@ -47,7 +48,6 @@ _RANGES: dict[str, tuple[float, float]] = {
     "gamma": (0, 1),
     "action_noise": (0, 1e6),
     "explore_beyond": (0, 1e6),
-    "random_action_prob": (0, 1),
     "hindsight": (0, 1),
     "goal_tolerance": (1e-6, 1),
     "shaping": (0, 1e6),
@@ -64,11 +64,11 @@ _WHOLE: dict[str, tuple[int, int]] = {
 }
 
 
-def check_numbers(arguments: dict[str, Any]) -> None:
-    """Refuse numbers out of range.
+def check_arguments(arguments: dict[str, Any]) -> None:
+    """Refuse numbers out of range, and choices that there are not.
 
     :param arguments: the agent's keyword arguments
-    :raises ValueError: naming the argument and its range
+    :raises ValueError: naming the argument and what it may be
     """
     noise, train_freq = arguments["action_noise"], arguments["train_freq"]
     given = {**arguments, "action_noise": noise if isinstance(noise, int | float | str) else 0.0}
@@ -84,6 +84,8 @@ def check_numbers(arguments: dict[str, Any]) -> None:
     frequency = train_freq[0] if isinstance(train_freq, tuple) else train_freq
     if isinstance(frequency, int) and not 1 <= frequency <= LONGEST_ROLLOUT:
         raise ValueError(f"train_freq must be from 1 to {LONGEST_ROLLOUT}, not {train_freq!r}.")
+    if arguments["skills"] not in SKILLS:
+        raise ValueError(f"skills must be one of {', '.join(map(repr, SKILLS))}, not {arguments['skills']!r}.")
 
 
 def box(space: spaces.Space) -> spaces.Box:

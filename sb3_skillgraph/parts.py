@@ -6,17 +6,18 @@ from typing import Any, NamedTuple
 import numpy as np
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_skillgraph.arguments import box, check_numbers, find_salience, goal_metric, horizon, option_class, option_kwargs
+from sb3_skillgraph.arguments import box, check_arguments, find_salience, goal_metric, horizon, option_class, option_kwargs
 from sb3_skillgraph.edges import NOWHERE
 from sb3_skillgraph.goal_env import GoalSpec, find_view
 from sb3_skillgraph.graph import SkillGraph
+from sb3_skillgraph.learning.growth import Growth, Skills
 from sb3_skillgraph.learning.missions import Agenda, Missions
-from sb3_skillgraph.learning.rollout import Rollout
+from sb3_skillgraph.learning.rollout import RANDOM_ACTION_PROB, Rollout
 from sb3_skillgraph.learning.witness import Witness
 from sb3_skillgraph.memory.store import TransitionStore
 from sb3_skillgraph.metric import Metric
 from sb3_skillgraph.options.average import AveragedPolicy
-from sb3_skillgraph.options.factory import OptionFactory, copy_policy
+from sb3_skillgraph.options.factory import OptionFactory
 from sb3_skillgraph.options.option import Option
 from sb3_skillgraph.options.parameters import set_skill_state, skill_state
 from sb3_skillgraph.options.views import ScaledView
@@ -62,7 +63,7 @@ class Common(NamedTuple):
         :param arguments: the agent's keyword arguments
         :param replay: further arguments of the options' replay buffers
         """
-        check_numbers(arguments)
+        check_arguments(arguments)
         rng = np.random.default_rng(agent.seed)
         metric = goal_metric(arguments["event_radius"], agent.env, spec.goal_dim)
         view_name, function = find_view(arguments["option_view"], agent.env, spec, metric)
@@ -93,7 +94,7 @@ class Common(NamedTuple):
         """
         noise = arguments["action_noise"]
         deviation = noise if isinstance(noise, int | float) else 0.0
-        return Rollout(runner, missions, witness, self.store, deviation, arguments["random_action_prob"], self.rng)
+        return Rollout(runner, missions, witness, self.store, deviation, RANDOM_ACTION_PROB, self.rng)
 
 
 @dataclass
@@ -112,7 +113,7 @@ class Parts:
     missions: Agenda
     witness: Witness
     rollout: Rollout
-    skills: dict[str, Option]
+    skills: Any  # :class:`Skills`; with ``**PAPER`` the options of its chains
     average: AveragedPolicy
 
     @classmethod
@@ -128,7 +129,7 @@ class Parts:
         graph = SkillGraph(spec.goal_dim, metric, arguments["max_events"], arguments["walk_steps"])
         model = WalkModel(metric.n_matched)
         planner = Planner(graph, model, horizon(agent.env))
-        skills: dict[str, Option] = {}
+        skills = Skills(graph, factory, walker)
         average = AveragedPolicy(walker.learner)  # what predict acts by
         runner = Runner(graph, planner, average.actor, view, skills)
         missions = Missions(
@@ -138,7 +139,7 @@ class Parts:
             arguments["explore_beyond"],
             rng,
         )
-        witness = Witness(graph, planner.choice_model, agent.n_envs)
+        witness = Witness(graph, planner.choice_model, agent.n_envs, Growth(arguments["skills"], graph, skills))
         # Who learns acts by the policy as it is.
         rollout = common.rollout(Runner(graph, planner, walker.actor, view, skills), missions, witness, arguments)
         known = (rng, view_name, factory, store, walker, graph, model, planner, runner, missions, witness, rollout)
@@ -149,23 +150,7 @@ class Parts:
         graph, walker = self.graph, self.walker
         learners = [self.skills.get(id, walker).learner for id in graph.walk_ids]
         known = zip(graph.walk_ids, graph.events, learners, strict=True)
-        return Walks((Walk(*each, self.specialise) for each in known), self.runner)
-
-    def specialise(self, walk: str) -> Option:
-        """Put a skill in the place of a walk (see :meth:`Walk.specialise`).
-
-        :param walk: id of the walk
-        """
-        if walk not in self.skills:
-            self.skills[walk] = self._make_skill(walk)
-            copy_policy(self.walker, self.skills[walk])
-        return self.skills[walk]
-
-    def _make_skill(self, walk: str) -> Option:
-        event = self.graph.events[self.graph.index(walk)]
-        skill = self.factory.make(walk, event.id, event)
-        skill.mature = True
-        return skill
+        return Walks((Walk(*each, self.skills.specialise) for each in known), self.runner)
 
     def plan(self, state: RunnerState, point: np.ndarray, goal: np.ndarray) -> Plan:
         """Tell how the agent goes about a goal.
@@ -210,9 +195,7 @@ class Parts:
         self.model.set_state(state["model"])
         self.average.set_state(state["average"])
         for spec in state["skills"]:
-            skill = self._make_skill(spec["record"]["id"])
-            set_skill_state(skill, spec, self.factory.device)
-            self.skills[skill.id] = skill
+            set_skill_state(self.skills.make(spec["record"]["id"]), spec, self.factory.device)
 
     def get_experience(self) -> dict[str, Any]:
         """Return what goes with the replay buffer, as plain data: the transitions, and which of them are which skill's own."""

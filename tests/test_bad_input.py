@@ -140,8 +140,8 @@ OUT_OF_RANGE: list[dict[str, Any]] = [
     dict(walk_steps=0),
     dict(exploration_steps=0),
     dict(explore_beyond=-1.0),
-    dict(random_action_prob=1.1),
-    dict(random_action_prob=None),
+    dict(skills="sometimes"),
+    dict(skills=None),
     dict(hindsight=-0.1),
     dict(shaping=-1.0),
 ]

@@ -180,8 +180,9 @@ def test_the_recipe_sees_no_end_where_its_goal_changes() -> None:
 
 
 def test_the_recipe_does_what_its_walker_does_where_there_is_no_noise() -> None:
-    silent = dict(learning_starts=0, gradient_steps=0, action_noise=0.0, random_action_prob=0.0)
-    recipe = HindsightRecipe(toy(), seed=0, **silent).learn(30)
+    recipe = HindsightRecipe(toy(), seed=0, learning_starts=0, gradient_steps=0, action_noise=0.0)
+    recipe.agent.parts.rollout.random_action_prob = 0.0
+    recipe.learn(30)
     store, rows = recipe.agent.parts.store, np.arange(30)
     seen = {name: store.column(name, rows) for name in ("observation", "achieved_goal")}
     acted = recipe.policy.predict({**seen, "desired_goal": store.column("goal", rows)})[0]

@@ -121,9 +121,8 @@ def test_other_option_classes_learn(option_class: type, extra: dict[str, Any]) -
 
 def actions_with(noise: Any, n_envs: int = 1) -> np.ndarray:
     """What an agent does that acts on without learning, and without random actions once the first walks are over."""
-    agent = new_agent(
-        new_vec_env(n_envs=n_envs), action_noise=noise, random_action_prob=0.0, learning_starts=0, gradient_steps=0
-    )
+    agent = new_agent(new_vec_env(n_envs=n_envs), action_noise=noise, learning_starts=0, gradient_steps=0)
+    agent.parts.rollout.random_action_prob = 0.0
     agent.learn(260)
     return agent.parts.store.get_state()["columns"]["action"]
 
@@ -156,7 +155,9 @@ def test_action_noise_may_be_a_number() -> None:
         dict(max_events=8, walk_steps=5),
         dict(buffer_size=100),
         dict(option_view="egocentric", event_radius=0.3),
-        dict(random_action_prob=1.0, exploration_steps=1),
+        dict(exploration_steps=1),
+        dict(skills="always"),
+        dict(skills="where_needed"),
     ],
     ids=lambda arguments: next(iter(arguments)),
 )

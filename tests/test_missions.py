@@ -9,6 +9,7 @@ import pytest
 from sb3_skillgraph.choice_model import ChoiceModel
 from sb3_skillgraph.graph import SkillGraph
 from sb3_skillgraph.learning import missions as missions_module
+from sb3_skillgraph.learning.growth import Growth
 from sb3_skillgraph.learning.missions import MAX_FAILURES, Mission, Missions
 from sb3_skillgraph.learning.rollout import HOLD, Rollout
 from sb3_skillgraph.learning.salience import MARGIN, FrontierSalience, RandomSalience, box_around
@@ -281,7 +282,7 @@ class Learning:
         planner = Planner(graph, model, 1_000)
         runner = Runner(graph, planner, Straight(), lambda observation, points, aims: (aims - points) / STEP)  # type: ignore[arg-type]
         missions = Missions(graph, Proposes(*proposals), EXPLORATION, BEYOND, self.rng)
-        witness = Witness(graph, ChoiceModel(graph, model), n_envs)
+        witness = Witness(graph, ChoiceModel(graph, model), n_envs, Growth("never", graph, {}))  # type: ignore[arg-type]
         self.store = TransitionStore(10_000, 2, 2, 2, n_envs)
         self.rollout = Rollout(
             runner, missions, witness, self.store, noise_std=NOISE, random_action_prob=random_actions, rng=self.rng

@@ -1,6 +1,7 @@
 """``PAPER``: the paper as written, section by section; the names of the tests tell which."""
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -466,10 +467,18 @@ def test_what_a_way_is_worth() -> None:
 # -- the agent --------------------------------------------------------------------------------------------------------
 
 
+@pytest.fixture(scope="module", autouse=True)
+def restless() -> Iterator[None]:
+    """Half of the steps are random, in loaded agents as well."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("sb3_skillgraph.parts.RANDOM_ACTION_PROB", 0.5)
+        yield
+
+
 def small(**kwargs: Any) -> SkillGraphAgent:
     """An agent that does as the paper does, with small networks and many events."""
     settings = {**PAPER, "rules": PaperRules(salient_event_freq=2, retry_after=1, timeout=30)}
-    easy = dict(policy_kwargs=dict(net_arch=[16, 16]), learning_starts=0, random_action_prob=0.5, event_radius=0.6)
+    easy = dict(policy_kwargs=dict(net_arch=[16, 16]), learning_starts=0, event_radius=0.6)
     return new_agent(**{**settings, **easy, **kwargs})
 
 

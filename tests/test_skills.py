@@ -1,6 +1,7 @@
 """A walk with a network of its own."""
 
 from pathlib import Path
+from typing import Literal
 
 import gymnasium as gym
 import numpy as np
@@ -9,7 +10,9 @@ from conftest import TOY, differences, state_of, without_clock
 from stable_baselines3 import DDPG
 
 from sb3_skillgraph import OptionEnv, OptionsEnv, SkillGraphAgent
+from sb3_skillgraph.learning.growth import GESTATION, RECENT
 from sb3_skillgraph.options.walk import Walk
+from sb3_skillgraph.running import Run
 
 
 def busiest(agent: SkillGraphAgent) -> int:
@@ -104,3 +107,77 @@ def test_a_skill_goes_with_its_event(trained: SkillGraphAgent, tmp_path: Path) -
     assert loaded.parts.skills.keys() == set(loaded.graph.walk_ids)
     assert len(loaded.parts.skills) < n_before
     loaded.learn(200, log_interval=None, reset_num_timesteps=False)
+
+
+# -- growth -----------------------------------------------------------------------------------------------------------
+
+
+class Trial:
+    """A walk that runs many times, with skills where needed."""
+
+    def __init__(self, agent: SkillGraphAgent) -> None:
+        self.agent, self.walk = agent, agent.graph.walk_ids[busiest(agent)]
+        self.growth = agent.parts.witness.growth
+        self.growth.mode = "where_needed"
+
+    def runs(self, *successes: bool) -> None:
+        for success in successes:
+            self.growth.ended(Run(0, "", self.walk, "", success, 10, np.zeros(2, np.float32), False, False))
+
+    @property
+    def has_skill(self) -> bool:
+        return self.walk in self.agent.parts.skills
+
+
+def test_a_skill_begins_where_a_walk_keeps_failing_and_stays_if_it_is_better(trained: SkillGraphAgent) -> None:
+    trial = Trial(trained)
+    trial.runs(*[True, False, True] * 6)
+    assert not trial.has_skill, "it succeeds more often than not"
+    trial.runs(False, False)
+    trial.runs(*[False] * 4)
+    assert trial.has_skill
+    assert len(trained.parts.skills) == 1
+    trial.runs(*[False] * (GESTATION - RECENT), *[True] * RECENT, *[False] * GESTATION)
+    assert trial.has_skill, "it is on trial once only: nothing flaps"
+
+
+def test_a_skill_that_is_no_better_goes_again_and_is_not_begun_soon(trained: SkillGraphAgent) -> None:
+    trial = Trial(trained)
+    trial.runs(*[True, False] * (RECENT // 2))
+    assert trial.has_skill
+    trial.runs(*[True, False] * (GESTATION // 2))
+    assert not trial.has_skill
+    trial.runs(*[False] * 5 * RECENT)
+    assert not trial.has_skill
+    trained.graph.now *= 2
+    trial.runs(False)
+    assert trial.has_skill, "the walker has learned as much once more"
+
+
+def test_nothing_grows_by_default(trained: SkillGraphAgent) -> None:
+    trial = Trial(trained)
+    trial.growth.mode = "never"
+    trial.runs(*[False] * 5 * RECENT)
+    assert not trial.has_skill
+
+
+@pytest.mark.usefixtures("one_thread")
+@pytest.mark.parametrize("skills", ["where_needed", "always"])
+def test_growth_is_saved_and_goes_on_exactly(skills: Literal["where_needed", "always"], tmp_path: Path) -> None:
+    agent = SkillGraphAgent("MultiInputPolicy", gym.make(TOY), seed=0, skills=skills, learning_starts=200)
+    agent.learn(1500, log_interval=None)
+    growth = agent.parts.witness.growth
+    if skills == "where_needed":
+        growth.skills.specialise(agent.graph.walk_ids[0])
+        growth._before[agent.graph.walk_ids[0]] = 0.25
+        assert growth._recent
+    else:
+        assert len(agent.parts.skills) > 1
+    agent.save(tmp_path / "agent")
+    agent.save_replay_buffer(tmp_path / "replay")
+    twin = SkillGraphAgent.load(tmp_path / "agent", env=gym.make(TOY))
+    twin.load_replay_buffer(tmp_path / "replay")
+    assert twin.parts.witness.growth.get_state() == growth.get_state()
+    for each in (agent, twin):
+        each.learn(500, log_interval=None, reset_num_timesteps=False)
+    assert differences(without_clock(state_of(agent)), without_clock(state_of(twin))) == []

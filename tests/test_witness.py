@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from sb3_skillgraph.choice_model import ChoiceModel
 from sb3_skillgraph.choices import EXPECTED
 from sb3_skillgraph.graph import MAX_DEGREE, SkillGraph
+from sb3_skillgraph.learning.growth import Growth
 from sb3_skillgraph.learning.witness import FIT_EVERY, Witness
 from sb3_skillgraph.running import Run
 from sb3_skillgraph.walk_model import FIRST_GUESS, HASTY_LOSS, WalkModel, timeout
@@ -21,7 +22,7 @@ every_time = settings(derandomize=True, deadline=None, max_examples=30, database
 def make_witness(n_envs: int = 1, *, walk_steps: int = 40, max_events: int = 100) -> Witness:
     """A witness of trajectories in the plane, where events have radius 1 and belong to those within 1.5."""
     graph = SkillGraph(2, 1.0, max_events, walk_steps)
-    return Witness(graph, ChoiceModel(graph, WalkModel()), n_envs)
+    return Witness(graph, ChoiceModel(graph, WalkModel()), n_envs, Growth("never", graph, {}))  # type: ignore[arg-type]
 
 
 def walk(witness: Witness, xs: list[float], env: int = 0, y: float = 0.0) -> list[bool]:

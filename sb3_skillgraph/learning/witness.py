@@ -9,6 +9,7 @@ from sb3_skillgraph.choice_model import ChoiceModel
 from sb3_skillgraph.choices import EXPECTED
 from sb3_skillgraph.edges import NOWHERE
 from sb3_skillgraph.graph import SkillGraph
+from sb3_skillgraph.learning.growth import Growth
 from sb3_skillgraph.planning import DIRECT
 from sb3_skillgraph.running import Run
 from sb3_skillgraph.walk_model import HASTY_LOSS, Kind, timeout
@@ -68,11 +69,13 @@ class Witness:
     :param graph: the skill graph
     :param choice_model: what is expected of options so far, and the model of untried walks
     :param n_envs: number of environments
+    :param growth: begins skills
     """
 
-    def __init__(self, graph: SkillGraph, choice_model: ChoiceModel, n_envs: int) -> None:
+    def __init__(self, graph: SkillGraph, choice_model: ChoiceModel, n_envs: int, growth: Growth) -> None:
         self.graph = graph
         self.choice_model = choice_model
+        self.growth = growth
         self._samples = np.zeros((N_SAMPLES, _COLUMNS + choice_model.model.n_matched))
         self._n_samples = 0
         self._n_steps = 0  # of all environments, since the last fit
@@ -185,6 +188,7 @@ class Witness:
         :param run: what became of it
         :param clean: whether the policy acted without noise; else it tells nothing of what it can do
         """
+        self.growth.ended(run)
         if not clean:
             return
         graph = self.graph
@@ -245,6 +249,7 @@ class Witness:
             "stays": [[list(astuple(stay)) for stay in stays] for stays in self._stays],
             "step": list(self._step),
             "began": self._began.copy(),
+            "growth": self.growth.get_state(),
         }
 
     def set_state(self, state: dict[str, Any]) -> None:
@@ -253,3 +258,4 @@ class Witness:
         self._samples[: len(state["samples"])] = state["samples"]
         self._stays = [[_Stay(*stay) for stay in stays] for stays in state["stays"]]
         self._step, self._began = list(state["step"]), np.array(state["began"])
+        self.growth.set_state(state["growth"])
