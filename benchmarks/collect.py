@@ -36,16 +36,17 @@ ENOUGH_SEEDS = 5
 N_SAMPLES = 10_000  # of the bootstrap
 
 
-def described(test: dict[str, Any], ours: dict[str, Any], shortest: Shortest | None) -> Row:
+def described(test: dict[str, Any], ours: dict[str, Any] | None, shortest: Shortest | None) -> Row:
     """Return what is kept of a test: rates, steps, falls.
 
     :param test: as a run wrote it
-    :param ours: that of the plan's first method after the same steps with the same pairs, or the same test
+    :param ours: that of the plan's first method after the same steps with the same pairs; None where there is none
     :param shortest: tells the fewest steps to a goal; None where nobody knows
     """
     pairs = test["pairs"]
     reached = [pair for pair in pairs if pair["success"]]
-    both = [(a["steps"], b["steps"]) for a, b in zip(pairs, ours["pairs"], strict=False) if a["success"] and b["success"]]
+    beside = zip(pairs, [] if ours is None else ours["pairs"], strict=False)
+    both = [(a["steps"], b["steps"]) for a, b in beside if a["success"] and b["success"]]
     of_first = sum(steps for _, steps in both)
     row: Row = {
         "pairs": len(pairs),
@@ -96,7 +97,7 @@ def rows_of(spec: RunSpec, first: RunSpec, out: pathlib.Path) -> dict[str, list[
     tables: dict[str, list[Row]] = {name: [] for name in KEYS}
     key = {"environment": spec.environment, "method": spec.method, "seed": spec.seed}
     for steps, seconds, test in tests_of(spec, out):
-        row = {**key, "steps": steps, "seconds": seconds, **described(test, reference.get(steps, test), shortest)}
+        row = {**key, "steps": steps, "seconds": seconds, **described(test, reference.get(steps), shortest)}
         tables["curves"].append(row)
         episodes = [*test["pairs"], *(pair for task in test.get("tasks", []) for pair in task)]
         promises = [(episode["promised"], episode["success"]) for episode in episodes if "promised" in episode]
@@ -106,7 +107,7 @@ def rows_of(spec: RunSpec, first: RunSpec, out: pathlib.Path) -> dict[str, list[
         tables["runs"] = [{**tables["curves"][-1], **version}]
     for name, test in read_json(spec.folder(out) / DONE)["also"].items():
         last = tables["curves"][-1]
-        also = described(test, reference.get(spec.steps, test), shortest)
+        also = described(test, reference.get(spec.steps), shortest)
         tables["runs"].append({**key, "method": name, "steps": spec.steps, "seconds": last["seconds"], **also, **version})
     return tables
 
