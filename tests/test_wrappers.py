@@ -177,6 +177,21 @@ def test_nested_goals_are_flattened_with_a_radius_for_each_entry() -> None:
     assert agent.metric.get_state() == env.goal_metric.get_state()
 
 
+@pytest.mark.mujoco
+def test_the_kitchen_has_flat_goals_by_name() -> None:
+    env = make_recommended("FrankaKitchen-v1", {})
+    assert isinstance(env, FlattenGoals) and env.spec is not None
+    assert "env_wrapper" not in load_hyperparams("FrankaKitchen-v1")
+    tasks = env.unwrapped.goal  # type: ignore[attr-defined]
+    assert env.observation_space["desired_goal"].shape == (sum(len(goal) for goal in tasks.values()),)
+    observation, _ = env.reset(seed=0)
+    reached = observation["desired_goal"].copy()
+    assert env.goal_metric.reached(reached, observation["desired_goal"])
+    reached[0] += 0.31
+    assert not env.goal_metric.reached(reached, observation["desired_goal"])
+    gym.make(env.spec).close()
+
+
 def test_only_nested_goals_are_flattened() -> None:
     with pytest.raises(ValueError, match="Dicts of Boxes"):
         FlattenGoals(gym.make("SkillGraph/ToyMaze-v0"), 0.1)

@@ -170,6 +170,16 @@ class FlattenGoals(gym.ObservationWrapper, gym.utils.RecordConstructorArgs):
         }
 
 
+def flat_kitchen(env: gym.Env) -> FlattenGoals:
+    """Make vectors of the goals of gymnasium-robotics' FrankaKitchen, whose tasks are done within its own threshold.
+
+    :param env: ``FrankaKitchen-v1``
+    """
+    from gymnasium_robotics.envs.franka_kitchen.kitchen_env import BONUS_THRESH
+
+    return FlattenGoals(env, BONUS_THRESH)
+
+
 class PursueGoals(gym.Wrapper, gym.utils.RecordConstructorArgs):
     """
     Makes a goal environment of any environment with Box observations.
