@@ -92,7 +92,7 @@ class SkillGraphAgent(OffPolicyAlgorithm):
     :param goal_tolerance: how near to its goal the walker must learn to come, in event radii, 1 at most
     :param shaping: reward for every event radius of distance gained, beside -1 a step; 0 for none [2.1]
     :param skills: when a walk gets a network of its own: ``"where_needed"``, where walks keep failing, ``"always"`` or
-        ``"never"`` (see :mod:`~sb3_skillgraph.learning.growth`) [2.2]
+        ``"never"`` (:mod:`~sb3_skillgraph.learning.growth`); with ``**PAPER`` all options have one in any case [2.2]
     :param rules: the paper's rules in place of the graph of walks: with ``**PAPER`` the paper as written; None for the default
     :raises ValueError: if the environment is no goal environment with Box actions, or an argument is out of range
     """

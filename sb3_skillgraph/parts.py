@@ -7,7 +7,6 @@ import numpy as np
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_skillgraph.arguments import box, check_arguments, find_salience, goal_metric, horizon, option_class, option_kwargs
-from sb3_skillgraph.edges import NOWHERE
 from sb3_skillgraph.goal_env import GoalSpec, find_view
 from sb3_skillgraph.graph import SkillGraph
 from sb3_skillgraph.learning.growth import Growth, Skills
@@ -150,7 +149,7 @@ class Parts:
         graph, walker = self.graph, self.walker
         learners = [self.skills.get(id, walker).learner for id in graph.walk_ids]
         known = zip(graph.walk_ids, graph.events, learners, strict=True)
-        return Walks((Walk(*each, self.skills.specialise) for each in known), self.runner)
+        return Walks((Walk(*each, self.witness.growth.specialise) for each in known), self.runner)
 
     def plan(self, state: RunnerState, point: np.ndarray, goal: np.ndarray) -> Plan:
         """Tell how the agent goes about a goal.
@@ -184,7 +183,7 @@ class Parts:
 
     def get_state(self) -> dict[str, Any]:
         """Return what has been learned beside the walker's networks, as plain data."""
-        skills = [skill_state(skill) for id, skill in self.skills.items() if self.graph.index(id) != NOWHERE]
+        skills = [skill_state(skill) for skill in self.skills.values()]
         learned = {"graph": self.graph.get_state(), "model": self.model.get_state(), "skills": skills}
         return {"horizon": self.planner.horizon, "average": self.average.get_state(), **learned}
 
@@ -211,7 +210,7 @@ class Parts:
         rows = transitions.pop("rows", {})
         self.store.set_state(transitions)
         for id, skill in self.runner.skills.items():
-            own = np.asarray(rows[id])
+            own = np.asarray(rows.get(id, ()))  # none of a skill that was begun later
             if own.ndim != 1 or (np.diff(own) <= 0).any() or not ((own >= 0) & (own < self.store.total)).all():
                 raise ValueError(f"The rows of option {id} in the file are none of a replay buffer of this size.")
             skill.replay.set_state({"rows": own})

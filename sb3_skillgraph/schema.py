@@ -32,7 +32,7 @@ from sb3_skillgraph.checking import (
     whole,
 )
 from sb3_skillgraph.edges import MAX_LANDINGS, NOWHERE
-from sb3_skillgraph.learning.growth import RECENT
+from sb3_skillgraph.learning.growth import ENOUGH_RUNS, GESTATION
 from sb3_skillgraph.learning.witness import N_SAMPLES
 from sb3_skillgraph.running import RunnerState
 from sb3_skillgraph.walk_model import N_FEATURES
@@ -252,7 +252,10 @@ def _rollout(n_envs: int, spec: Any, n_events: int, n_matched: int) -> Check:
             step=list_of(whole(), n_envs),
             began=array((n_envs, spec.goal_dim)),
             growth=entries(
-                recent=dict_of(_at_most(RECENT, list_of(flag))), before=dict_of(number(0.0, 1.0)), again=dict_of(number(0.0))
+                runs=dict_of(_at_most(GESTATION, list_of(flag))),
+                suspects=list_of(text),
+                before=dict_of(whole(0, ENOUGH_RUNS)),
+                again=dict_of(number(0.0)),
             ),
         ),
     )

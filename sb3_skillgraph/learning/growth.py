@@ -1,6 +1,5 @@
 """Growth: options get networks of their own where walks fail (sections 2.2, 3.2.5)."""
 
-from collections import deque
 from typing import Any, Literal
 
 from sb3_skillgraph.edges import NOWHERE
@@ -9,15 +8,14 @@ from sb3_skillgraph.options.factory import OptionFactory, copy_policy
 from sb3_skillgraph.options.option import Option
 from sb3_skillgraph.running import Run
 
-#: Runs that tell how good an option is now: the last so many.
-RECENT = 20
-#: A walk fails if it does so in this share of its recent runs.
-FAILING = 0.5
-#: Runs for which a skill learns before it is asked what it is good for: the paper's options are mature sooner, but there
-#: nothing else could take their place.
+#: Runs that tell how good an option is, with noise or without: few are without.
+ENOUGH_RUNS = 20
+#: A walk fails that has reached its event in no more of so many runs.
+FAILING = 10
+#: Runs for which a skill learns before it is asked what it is good for.
 GESTATION = 60
-#: By so much must it succeed more often than the walk did: half of what twenty runs can err by.
-GAIN = 0.1
+#: So many more runs must succeed than did before: of skills that are as good as the walk an eighth will seem so much better.
+GAIN = 4
 
 
 class Skills(dict[str, Option]):
@@ -38,16 +36,20 @@ class Skills(dict[str, Option]):
         """Put a new skill in the place of a walk.
 
         :param walk: its id
+        :raises ValueError: if there is no such walk
         """
-        event = self.graph.events[self.graph.index(walk)]
-        skill = self[walk] = self.factory.make(walk, event.id, event)
+        index = self.graph.index(walk)
+        if index == NOWHERE:
+            raise ValueError(f"There is no walk {walk!r} in the graph (any more).")
+        skill = self[walk] = self.factory.make(walk, self.graph.events[index].id, self.graph.events[index])
         skill.mature = True
         return skill
 
     def specialise(self, walk: str) -> Option:
-        """Put a skill in the place of a walk that begins as a copy of it (see :meth:`Walk.specialise`).
+        """Put a skill in the place of a walk that begins as a copy of it.
 
         :param walk: its id
+        :raises ValueError: if there is no such walk
         """
         if walk not in self:
             copy_policy(self.walker, self.make(walk))
@@ -57,7 +59,8 @@ class Skills(dict[str, Option]):
 class Growth:
     """Begins a skill where a walk keeps failing, and drops it again if it is no better.
 
-    The graph does the chaining: where a skill ends, in an event, other options begin.
+    The graph does the chaining: where a skill ends, in an event, other options begin. The walk's edges keep their records,
+    which age as the skill learns.
 
     :param mode: ``"where_needed"``, ``"always"`` (whenever a walk has run), or ``"never"``
     :param graph: the skill graph
@@ -68,56 +71,74 @@ class Growth:
         self.mode = mode
         self.graph = graph
         self.skills = skills
-        self._recent: dict[str, deque[bool]] = {}  # whether runs succeeded
-        self._before: dict[str, float] = {}  # the success rate of walks in whose place there is a skill on trial
+        self._runs: dict[str, list[bool]] = {}  # which runs succeeded, since the option was last judged
+        self._suspects: dict[str, bool] = {}  # the walks that have failed, of which is measured how often they do
+        self._before: dict[str, int] = {}  # successes of the walks in whose place there is a skill on trial
         self._again: dict[str, float] = {}  # the updates of the walker before which there is not to be another
+
+    def specialise(self, walk: str) -> Option:
+        """Give a walk a network of its own for good (see :meth:`Walk.specialise`).
+
+        :param walk: its id
+        :raises ValueError: if there is no such walk
+        """
+        self._before.pop(walk, None)  # no trial any more
+        return self.skills.specialise(walk)
 
     def ended(self, run: Run) -> None:
         """A run has ended.
 
         :param run: what became of it
         """
-        if self.mode == "never" or self.graph.index(run.option) == NOWHERE:
+        walk = run.option
+        if self.graph.index(walk) == NOWHERE:
             return
+        if walk in self.skills:
+            self.skills[walk].n_runs += 1
+            self.skills[walk].n_successes += run.success
         if self.mode == "always":
-            self.skills.specialise(run.option)
-            return
-        recent = self._recent.setdefault(run.option, deque(maxlen=RECENT))
-        recent.append(run.success)
-        skill = self.skills.get(run.option)
-        if skill is not None:
-            skill.n_runs += 1
-            skill.n_successes += run.success
-        if len(recent) == RECENT:
-            self._judge(run.option, skill, sum(recent) / RECENT)
+            self.skills.specialise(walk)
+        if self.mode == "where_needed":
+            runs = self._runs.setdefault(walk, [])
+            runs.append(run.success)
+            if len(runs) == (GESTATION if walk in self._before else ENOUGH_RUNS):
+                self._judge(walk, sum(runs[-ENOUGH_RUNS:]))
+                runs.clear()
 
-    def _judge(self, walk: str, skill: Option | None, rate: float) -> None:
+    def _judge(self, walk: str, n_successes: int) -> None:
         """Begin a skill, or drop it.
 
         :param walk: id of the option
-        :param skill: the skill in its place, if there is one
-        :param rate: share of its recent runs that succeeded
+        :param n_successes: of its last runs
         """
-        # A walk that keeps failing gets a network of its own
-        if skill is None and rate <= 1.0 - FAILING and self.graph.now >= self._again.get(walk, 0.0):
-            self.skills.specialise(walk)
-            self._before[walk] = rate
-            self._recent[walk].clear()
         # A skill that is no better than the walk was goes again, until the walker has learned as much once more
-        elif skill is not None and walk in self._before and skill.n_runs >= GESTATION:
-            gain = rate - self._before.pop(walk)
-            if gain < GAIN:
+        if walk in self._before:
+            if n_successes < self._before.pop(walk) + GAIN:
                 del self.skills[walk]
                 self._again[walk] = 2.0 * self.graph.now
-                self._recent[walk].clear()
+        elif walk in self.skills:
+            return
+        # A walk that has failed is measured anew: the runs that made it a suspect were unlucky ones, too
+        elif self._suspects.pop(walk, False):
+            if n_successes + GAIN <= ENOUGH_RUNS:
+                self._before[walk] = n_successes
+                self.skills.specialise(walk)
+        elif n_successes <= FAILING and self.graph.now >= self._again.get(walk, 0.0):
+            self._suspects[walk] = True
+
+    def merged(self) -> None:
+        """Forget options to events that are gone, after others were merged."""
+        for known in (self.skills, self._runs, self._suspects, self._before, self._again):
+            for walk in [walk for walk in known if self.graph.index(walk) == NOWHERE]:
+                del known[walk]
 
     def get_state(self) -> dict[str, Any]:
-        """Return everything as plain data; nothing of events that are gone."""
-        recent = {walk: list(runs) for walk, runs in self._recent.items()}
-        kept = {"recent": recent, "before": self._before, "again": self._again}
-        return {name: {k: v for k, v in of.items() if self.graph.index(k) != NOWHERE} for name, of in kept.items()}  # type: ignore[attr-defined]
+        """Return everything as plain data."""
+        runs = {walk: list(successes) for walk, successes in self._runs.items()}
+        return {"runs": runs, "suspects": list(self._suspects), "before": dict(self._before), "again": dict(self._again)}
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Restore what :meth:`get_state` returned."""
-        self._recent = {walk: deque(runs, maxlen=RECENT) for walk, runs in state["recent"].items()}
+        self._runs = {walk: list(successes) for walk, successes in state["runs"].items()}
+        self._suspects = dict.fromkeys(state["suspects"], True)
         self._before, self._again = dict(state["before"]), dict(state["again"])

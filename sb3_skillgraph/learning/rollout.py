@@ -17,7 +17,7 @@ from sb3_skillgraph.running import RunnerState
 #: A random action is held for so many environment steps in the mean: single ones average out.
 HOLD = 10
 #: Share of the steps on the way that are random. With none, or twice as many, Medium was at .92, .97 after 10 000 steps
-#: instead of 1.00 (three seeds).
+#: instead of 1.00 (three seeds, not told apart).
 RANDOM_ACTION_PROB = 0.1
 
 

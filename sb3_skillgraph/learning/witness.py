@@ -164,6 +164,7 @@ class Witness:
         while len(self.graph.events) >= self.graph.max_events:
             # Trajectories under way are in the events that others were merged into; the point may be in one, too, now
             new_index = self.graph.coarsen()
+            self.growth.merged()
             for stays in self._stays:
                 for stay in stays:
                     stay.event = int(new_index[stay.event])

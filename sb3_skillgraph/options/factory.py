@@ -15,6 +15,7 @@ from sb3_skillgraph.memory.replay import OptionReplay
 from sb3_skillgraph.memory.store import TransitionStore
 from sb3_skillgraph.metric import Metric
 from sb3_skillgraph.options.option import Option, goal_rule, termination_rule
+from sb3_skillgraph.options.parameters import parameters, set_parameters
 from sb3_skillgraph.options.views import ScaledView
 
 
@@ -126,5 +127,4 @@ def copy_policy(source: Option, target: Option) -> None:
     :param source: the option copied from
     :param target: the option copied to
     """
-    parameters: dict[str, Any] = copy.deepcopy(source.learner.get_parameters())
-    target.learner.set_parameters(parameters)
+    set_parameters(target.learner, copy.deepcopy(parameters(source.learner)), True, target.learner.device)
