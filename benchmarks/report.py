@@ -281,8 +281,8 @@ def readme_table() -> str:
     for plan, shown in (
         ("point_mazes", ("medium", "hard")),
         ("kept", ("key-door",)),
-        ("foreign", ("fetch-reach", "panda-reach", "point-large")),
-        ("ants", ("ant-umaze", "ant-reacher", "ant-medium")),
+        ("foreign", ("fetch-reach", "panda-reach", "point-large", "ant-umaze-v5")),
+        ("ants", ("ant-umaze", "ant-medium")),
     ):
         rows = {(row["environment"], row["method"]): row for row in summary(plan)}
         for environment in shown:
