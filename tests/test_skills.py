@@ -191,11 +191,12 @@ def test_a_walk_that_hardly_fails_any_more_stays(trained: SkillGraphAgent) -> No
 
 def test_what_is_made_by_hand_is_not_on_trial(trained: SkillGraphAgent) -> None:
     trial = Trial(trained)
-    trial.runs(2 * ENOUGH_RUNS, 0)
+    trial.runs(3 * ENOUGH_RUNS - 5, 0)
     assert trial.has_skill
     skill = trained.options[busiest(trained)].specialise()
     trial.runs(3 * GESTATION, 0)
     assert trained.parts.skills[trial.walk] is skill
+    assert len(trial.growth.get_state()["runs"].get(trial.walk, [])) < ENOUGH_RUNS, "nothing grows"
 
 
 def test_nothing_grows_by_default(trained: SkillGraphAgent) -> None:
@@ -249,7 +250,7 @@ def test_growth_is_saved_and_goes_on_exactly(skills: Literal["where_needed", "al
     if skills == "where_needed":  # a skill soon to be judged, and a walk that is measured
         trial.growth._runs.pop(trial.walk)
         trial.runs(2 * ENOUGH_RUNS + GESTATION - 1, 0)
-        trial.growth._suspects[agent.graph.walk_ids[0]] = True
+        trial.growth._suspects.add(agent.graph.walk_ids[0])
         trial.growth._again[agent.graph.walk_ids[0]] = 1e6
     assert trial.has_skill
     agent.save(tmp_path / "agent")

@@ -72,7 +72,7 @@ class Growth:
         self.graph = graph
         self.skills = skills
         self._runs: dict[str, list[bool]] = {}  # which runs succeeded, since the option was last judged
-        self._suspects: dict[str, bool] = {}  # the walks that have failed, of which is measured how often they do
+        self._suspects: set[str] = set()  # the walks that have failed, of which is measured how often they do
         self._before: dict[str, int] = {}  # successes of the walks in whose place there is a skill on trial
         self._again: dict[str, float] = {}  # the updates of the walker before which there is not to be another
 
@@ -82,7 +82,9 @@ class Growth:
         :param walk: its id
         :raises ValueError: if there is no such walk
         """
-        self._before.pop(walk, None)  # no trial any more
+        # No trial any more
+        self._before.pop(walk, None)
+        self._runs.pop(walk, None)
         return self.skills.specialise(walk)
 
     def ended(self, run: Run) -> None:
@@ -101,7 +103,7 @@ class Growth:
         if self.mode == "where_needed":
             runs = self._runs.setdefault(walk, [])
             runs.append(run.success)
-            if len(runs) == (GESTATION if walk in self._before else ENOUGH_RUNS):
+            if len(runs) >= (GESTATION if walk in self._before else ENOUGH_RUNS):
                 self._judge(walk, sum(runs[-ENOUGH_RUNS:]))
                 runs.clear()
 
@@ -114,31 +116,33 @@ class Growth:
         # A skill that is no better than the walk was goes again, until the walker has learned as much once more
         if walk in self._before:
             if n_successes < self._before.pop(walk) + GAIN:
-                del self.skills[walk]
+                self.skills.pop(walk, None)
                 self._again[walk] = 2.0 * self.graph.now
         elif walk in self.skills:
             return
         # A walk that has failed is measured anew: the runs that made it a suspect were unlucky ones, too
-        elif self._suspects.pop(walk, False):
+        elif walk in self._suspects:
+            self._suspects.remove(walk)
             if n_successes + GAIN <= ENOUGH_RUNS:
                 self._before[walk] = n_successes
                 self.skills.specialise(walk)
         elif n_successes <= FAILING and self.graph.now >= self._again.get(walk, 0.0):
-            self._suspects[walk] = True
+            self._suspects.add(walk)
 
     def merged(self) -> None:
         """Forget options to events that are gone, after others were merged."""
-        for known in (self.skills, self._runs, self._suspects, self._before, self._again):
+        for known in (self.skills, self._runs, self._before, self._again):
             for walk in [walk for walk in known if self.graph.index(walk) == NOWHERE]:
                 del known[walk]
+        self._suspects = {walk for walk in self._suspects if self.graph.index(walk) != NOWHERE}
 
     def get_state(self) -> dict[str, Any]:
         """Return everything as plain data."""
         runs = {walk: list(successes) for walk, successes in self._runs.items()}
-        return {"runs": runs, "suspects": list(self._suspects), "before": dict(self._before), "again": dict(self._again)}
+        return {"runs": runs, "suspects": sorted(self._suspects), "before": dict(self._before), "again": dict(self._again)}
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Restore what :meth:`get_state` returned."""
         self._runs = {walk: list(successes) for walk, successes in state["runs"].items()}
-        self._suspects = dict.fromkeys(state["suspects"], True)
+        self._suspects = set(state["suspects"])
         self._before, self._again = dict(state["before"]), dict(state["again"])
