@@ -264,6 +264,11 @@ def soak() -> str:
     )
 
 
+def lone(row: Row) -> str:
+    """Return what is added to a number that a single seed has given."""
+    return " (one seed)" if row["seeds"] == 1 else ""
+
+
 def beside(rows: dict[tuple[str, str], Row], environment: str, name: str) -> list[str]:
     """Return what other methods came to, where they were run; a single seed is told.
 
@@ -272,7 +277,7 @@ def beside(rows: dict[tuple[str, str], Row], environment: str, name: str) -> lis
     :param name: column
     """
     others = [rows.get((environment, method)) for method in ("straight-on", "ddpg-her")]
-    return ["" if row is None else f"{row[name]:.2f}" + " (one seed)" * (row["seeds"] == 1) for row in others]
+    return ["" if row is None else f"{row[name]:.2f}{lone(row)}" for row in others]
 
 
 def readme_table() -> str:
@@ -291,7 +296,7 @@ def readme_table() -> str:
     official = {(row["environment"], row["method"]): row for row in [*summary("ogbench"), *summary("ogbench_ants")]}
     for environment in ("giant", "teleport", "ant-medium"):
         ours = official[environment, "skill-graph"]
-        success = f"{ours['task_success_rate']:.3f}" + " (one seed)" * (ours["seeds"] == 1)
+        success = f"{ours['task_success_rate']:.3f}{lone(ours)}"
         if environment in PUBLISHED:
             success += f"; best published, offline: {PUBLISHED[environment]}"
         lines.append(
