@@ -7,7 +7,6 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.utils import polyak_update
 
 from sb3_skillgraph.options.numpy_actor import NumpyActor
 
@@ -29,6 +28,9 @@ class AveragedPolicy:
         self.learner = learner
         self._mean: BasePolicy = copy.deepcopy(self._now)
         self.actor = NumpyActor(self._mean)
+        # Found once: looking through the modules takes longer than the mean.
+        self._parameters = list(self._now.parameters()), list(self._mean.parameters())
+        self._buffers = list(self._now.buffers()), list(self._mean.buffers())  # counts, running means
 
     @property
     def _now(self) -> BasePolicy:
@@ -43,9 +45,13 @@ class AveragedPolicy:
         """
         window = max(SHARE * (self.learner._n_updates - YOUNG), 1.0)
         weight = 1.0 - (1.0 - 1.0 / window) ** n_updates
-        polyak_update(self._now.parameters(), self._mean.parameters(), weight)
-        for now, mean in zip(self._now.buffers(), self._mean.buffers(), strict=True):  # counts, running means
-            mean.copy_(now)
+        now, mean = self._parameters
+        # SB3's polyak_update, in two calls for all layers
+        with th.no_grad():
+            th._foreach_mul_(mean, 1.0 - weight)
+            th._foreach_add_(mean, now, alpha=weight)
+        for now_buffer, mean_buffer in zip(*self._buffers, strict=True):
+            mean_buffer.copy_(now_buffer)
 
     def restart(self) -> None:
         """Begin with the actor as it is: it was replaced by another."""

@@ -66,11 +66,13 @@ class CompiledUpdate:
         return same_objects and self._find_layout() == self._layout
 
     def _find_layout(self) -> list[Any]:
+        # Asked before all updates of a step, so in as few words as it takes
         states = [state for optimizer in self._optimizers for state in optimizer.state.values()]
         moments = [moment for state in states for moment in state.values()]
         options = [optimizer.param_groups[0].get(name) for optimizer in self._optimizers for name in ADAM_OPTIONS]
-        tensors = (*self._parameters, *moments)
-        return [*options, *((each.data_ptr(), each.stride(), each.requires_grad) for each in tensors)]
+        learning = [parameter.requires_grad for parameter in self._parameters]
+        strides = [parameter.stride() for parameter in self._parameters]
+        return [options, learning, strides, [tensor.data_ptr() for tensor in self._parameters + moments]]
 
     def update(self, data: ReplayBufferSamples, model: TD3, penalty: float, with_actor: bool) -> tuple[float, float]:
         """
@@ -84,16 +86,16 @@ class CompiledUpdate:
         """
         # Drawn even where it is clipped to nothing (DDPG), so that torch's generator ends where SB3 leaves it.
         noise = th.empty_like(data.actions).normal_(0, model.target_policy_noise)
-        noise = noise.clamp_(-model.target_noise_clip, model.target_noise_clip)
-        discounts = (1 - data.dones) * (model.gamma if data.discounts is None else data.discounts)
         n = len(noise)
+        noise_rows, dones = _rows(noise, n, self._n_actions), _rows(data.dones, n, 1)
+        discount = np.float32(model.gamma) if data.discounts is None else _rows(data.discounts, n, 1)
         batch = (
             _rows(data.observations, n, self._n_observations),
             _rows(data.actions, n, self._n_actions),
             _rows(data.next_observations, n, self._n_observations),
-            _rows(noise, n, self._n_actions),
+            noise_rows.clip(-model.target_noise_clip, model.target_noise_clip),
             _rows(data.rewards, n, 1),
-            _rows(discounts, n, 1),
+            (np.float32(1) - dones) * discount,
         )
         tau = model.tau if with_actor else 0.0
         actor_rates, critic_rates = (_rates(optimizer, tau) for optimizer in self._optimizers)
