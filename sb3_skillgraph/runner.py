@@ -113,9 +113,8 @@ class Runner:
             landing = GOAL if option == DIRECT else self.graph.id(index)
         else:
             landing = "" if lost else self.graph.id(self.graph.locate(point))
-        stood_still = not (arrived or lost) and state.still[i] >= STILL_STEPS
         steps, aim = int(state.steps[i]), state.aim[i].copy()
-        return Run(i, str(state.began[i]), option, landing, arrived, steps, aim, stood_still, lost)
+        return Run(i, str(state.began[i]), option, landing, arrived, steps, aim, lost)
 
     def act(
         self,

@@ -29,7 +29,6 @@ class Run:
     :param success: whether it reached its termination set
     :param steps: environment steps it took
     :param aim: where it walked to, shape ``(goal_dim,)``
-    :param stood_still: whether it ended since the agent stood still
     :param stuck: whether it ended since the agent can do nothing any more
     """
 
@@ -40,7 +39,6 @@ class Run:
     success: bool
     steps: int
     aim: np.ndarray
-    stood_still: bool = False
     stuck: bool = False
 
 

@@ -222,6 +222,24 @@ def test_who_has_reached_the_goal_that_is_adapted_to_goes_elsewhere_to_come_back
     assert goals == {tuple(center) for center in missions.graph.centers}
 
 
+@pytest.mark.parametrize("arrived", [True, False])
+def test_who_has_explored_as_far_as_a_point_or_a_wall_goes_on_towards_another(arrived: bool) -> None:
+    missions = make_missions(line_graph(3), (9.0, 2.0), (0.0, 5.0))
+    mission = pursue(missions, Mission(HERE, explore_steps=EXPLORATION, beyond=THERE, exploring=True))
+    assert not missions.observe(0, HERE, None, False)
+    np.testing.assert_array_equal(mission.beyond, THERE)
+    assert not missions.observe(0, HERE, run_to(THERE, arrived), False)
+    np.testing.assert_allclose(mission.beyond, [0.0, 5.0 + BEYOND])
+    assert (mission.exploring, mission.explore_steps, mission.n_failures) == (True, EXPLORATION - 2, 0)
+
+
+def test_a_random_walk_stays_one_when_its_option_ends() -> None:
+    missions = make_missions(line_graph(3), (9.0, 2.0))
+    mission = pursue(missions, Mission(HERE, explore_steps=EXPLORATION, exploring=True))
+    missions.observe(0, HERE, run_to(HERE, True), False)
+    assert mission.random_walk
+
+
 def test_restored_missions_go_on() -> None:
     missions = make_missions(line_graph(3), (9.0, 2.0))
     missions.pinned = np.array([12.0, 3.0])
@@ -413,7 +431,7 @@ def test_no_landmark_lies_where_agents_get_stuck() -> None:
 
 def test_a_proposed_point_that_is_reached_becomes_a_salient_event() -> None:
     learning = Learning()
-    mission = Mission(np.zeros(2), 60, np.array([3.2, 0.0]), clean=True)
+    mission = Mission(np.zeros(2), 60, np.array([2.4, 0.0]), clean=True)
     learning.missions.current[0] = mission
     for _ in range(12):
         learning.step()
@@ -421,7 +439,7 @@ def test_a_proposed_point_that_is_reached_becomes_a_salient_event() -> None:
             break
     salient = [event for event in learning.graph.events if event.salient]
     assert len(salient) == 1
-    assert np.linalg.norm(salient[0].center - [3.2, 0.0]) <= 1.0
+    assert np.linalg.norm(salient[0].center - [2.4, 0.0]) <= 1.0
 
 
 def test_a_new_mission_forgets_what_happened_on_the_last() -> None:

@@ -151,11 +151,13 @@ class Missions(Agenda):
         mission = self.current[env]
         assert mission is not None
         was_exploring = mission.exploring
-        # Failed runs on the way are counted: who cannot get there does something else
-        if run is not None:
+        if run is not None and mission.exploring and mission.beyond is not None:
+            # Whether it has arrived or stands before a wall, from here it goes on towards another point
+            proposal = self.salience.propose(self.rng)
+            mission.beyond = None if proposal is None else self._past(point, proposal)
+        elif run is not None:
+            # Failed runs on the way are counted: who cannot get there does something else
             mission.n_failures += not run.success
-            if mission.exploring and run.stood_still:
-                mission.beyond = None  # who cannot get on towards the point walks at random
         over = self._over(mission, point)
         if over or done:
             self.current[env] = None
@@ -216,7 +218,11 @@ class Missions(Agenda):
         goal = self.graph.centers[event].copy()
         if self.rng.random() >= TOWARDS:
             return Mission(goal, self.exploration_steps)
-        return Mission(goal, self.exploration_steps, self.graph.metric.beyond(goal, point, self.explore_beyond))
+        return Mission(goal, self.exploration_steps, self._past(goal, point))
+
+    def _past(self, begin: np.ndarray, point: np.ndarray) -> np.ndarray:
+        """Return where an exploration that begins somewhere goes for a proposed point: as far past it as is wanted."""
+        return self.graph.metric.beyond(begin, point, self.explore_beyond)
 
     def _adapt(self, point: np.ndarray, goal: np.ndarray) -> Mission:
         """Pursue the goal that adaptation is for; look for a way to it while nobody has been there (section 3.3)."""

@@ -29,7 +29,7 @@ class AveragedPolicy:
         self._mean: BasePolicy = copy.deepcopy(self._now)
         self.actor = NumpyActor(self._mean)
         # Found once: looking through the modules takes longer than the mean.
-        self._parameters = list(self._now.parameters()), list(self._mean.parameters())
+        self._parameters: tuple[list[th.Tensor], list[th.Tensor]] = [*self._now.parameters()], [*self._mean.parameters()]
         self._buffers = list(self._now.buffers()), list(self._mean.buffers())  # counts, running means
 
     @property

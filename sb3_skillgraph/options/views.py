@@ -80,18 +80,18 @@ def _seen_from_body(observation: np.ndarray, achieved_goal: np.ndarray, goal: np
         )
     # Column by column: all of this is done for every minibatch, and arrays of two columns are slow to compute with.
     w, x, y, z = observation[:, 1:5].T.copy()
-    heading = _unit(1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z))[:2]
+    cosine, sine, _ = _unit(1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z))
     ahead, aside, distance = _unit(*(goal - achieved_goal).T)
-    velocity = slice(5 + n_joints, 7 + n_joints)
+    vx, vy = observation[:, 5 + n_joints : 7 + n_joints].T
     seen = np.empty((len(observation), 13 + 2 * n_joints), np.result_type(observation, ahead))
     seen[:, 0] = observation[:, 0]
     seen[:, 1], seen[:, 2], seen[:, 3] = 2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)
     seen[:, 4 : 4 + n_joints] = observation[:, 5 : 5 + n_joints]
-    seen[:, 4 + n_joints], seen[:, 5 + n_joints] = _turned(*observation[:, velocity].T, *heading)
+    seen[:, 4 + n_joints], seen[:, 5 + n_joints] = _turned(vx, vy, cosine, sine)
     seen[:, 6 + n_joints : -3] = observation[:, 7 + n_joints :]
-    seen[:, -3], seen[:, -2] = _turned(ahead, aside, *heading)
+    seen[:, -3], seen[:, -2] = _turned(ahead, aside, cosine, sine)
     seen[:, -1] = DISTANCE_UNIT * distance
-    return seen, np.stack(heading, axis=1)
+    return seen, np.stack([cosine, sine], axis=1)
 
 
 def _unit(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
