@@ -431,6 +431,7 @@ def test_no_landmark_lies_where_agents_get_stuck() -> None:
 
 def test_a_proposed_point_that_is_reached_becomes_a_salient_event() -> None:
     learning = Learning()
+    # It is reached a step before the next landmark would lie there.
     mission = Mission(np.zeros(2), 60, np.array([2.4, 0.0]), clean=True)
     learning.missions.current[0] = mission
     for _ in range(12):

@@ -34,7 +34,7 @@ def test_a_skill_begins_as_the_walk_and_learns_from_its_runs(trained: SkillGraph
     after = next(option for option in trained.options if option.id == walk.id)
     assert after.learner is skill.learner is not trained.parts.walker.learner
     np.testing.assert_array_equal(weights(skill), weights(trained.parts.walker))
-    trained.learn(3000, log_interval=None, reset_num_timesteps=False)
+    trained.learn(6000, log_interval=None, reset_num_timesteps=False)
     own = skill.replay._readable()
     assert len(own) > 64
     assert 0 < skill.learner._n_updates <= len(own)
@@ -140,7 +140,7 @@ class Trial:
 
     def runs(self, n: int, n_successes: int) -> None:
         for i in range(n):
-            self.growth.ended(Run(0, "", self.walk, "", i < n_successes, 10, np.zeros(2, np.float32), False, False))
+            self.growth.ended(Run(0, "", self.walk, "", i < n_successes, 10, np.zeros(2, np.float32)))
 
     @property
     def has_skill(self) -> bool:
@@ -244,7 +244,7 @@ def trained_sac() -> SkillGraphAgent:
 @pytest.mark.parametrize("skills", ["where_needed", "always"])
 def test_growth_is_saved_and_goes_on_exactly(skills: Literal["where_needed", "always"], tmp_path: Path) -> None:
     agent = SkillGraphAgent("MultiInputPolicy", gym.make(TOY), seed=0, skills=skills, learning_starts=200)
-    agent.learn(1500, log_interval=None)
+    agent.learn(3000, log_interval=None)
     trial = Trial(agent)
     trial.growth.mode = skills
     if skills == "where_needed":  # a skill soon to be judged, and a walk that is measured
@@ -259,6 +259,6 @@ def test_growth_is_saved_and_goes_on_exactly(skills: Literal["where_needed", "al
     twin.load_replay_buffer(tmp_path / "replay")
     assert twin.parts.witness.growth.get_state() == trial.growth.get_state()
     for each in (agent, twin):
-        each.learn(500, log_interval=None, reset_num_timesteps=False)
+        each.learn(1500, log_interval=None, reset_num_timesteps=False)
     assert differences(without_clock(state_of(agent)), without_clock(state_of(twin))) == []
     assert trial.has_skill == (skills == "always"), "the judgement has come"
