@@ -108,6 +108,15 @@ def test_one_number_in_and_one_out():
     assert distance(a, b) <= 1e-5
 
 
+def test_a_moment_that_is_turned_over_where_it_lies_is_refused():
+    model = make(OptionTD3, [16, 16])
+    train(model, 2)
+    moment = model.actor.optimizer.state[model.actor.mu[2].weight]["exp_avg"]
+    moment.data = moment.data.t()
+    with pytest.raises(ValueError, match="not contiguous"):
+        train(model, 1)
+
+
 def load_moments(a, b):
     for x, y in ((a.actor, b.actor), (a.critic, b.critic)):
         x.optimizer.load_state_dict(copy.deepcopy(y.optimizer.state_dict()))

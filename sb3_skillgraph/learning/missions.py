@@ -147,7 +147,7 @@ class Missions(Agenda):
         self.explore_beyond = explore_beyond
 
     def observe(self, env: int, point: np.ndarray, run: Run | None, done: bool) -> bool:
-        """Learn that a step was taken: the mission may be over, or its exploration begin."""
+        """Learn that a step was taken: the mission may be over, or its exploration begin, or turn to another point."""
         mission = self.current[env]
         assert mission is not None
         was_exploring = mission.exploring

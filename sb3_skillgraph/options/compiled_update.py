@@ -68,11 +68,10 @@ class CompiledUpdate:
     def _find_layout(self) -> list[Any]:
         # Asked before all updates of a step, so in as few words as it takes
         states = [state for optimizer in self._optimizers for state in optimizer.state.values()]
-        moments = [moment for state in states for moment in state.values()]
+        tensors = [*self._parameters, *(moment for state in states for moment in state.values())]
         options = [optimizer.param_groups[0].get(name) for optimizer in self._optimizers for name in ADAM_OPTIONS]
         learning = [parameter.requires_grad for parameter in self._parameters]
-        strides = [parameter.stride() for parameter in self._parameters]
-        return [options, learning, strides, [tensor.data_ptr() for tensor in self._parameters + moments]]
+        return [options, learning, [tensor.data_ptr() for tensor in tensors], [tensor.stride() for tensor in tensors]]
 
     def update(self, data: ReplayBufferSamples, model: TD3, penalty: float, with_actor: bool) -> tuple[float, float]:
         """
@@ -85,17 +84,16 @@ class CompiledUpdate:
         :return: the critics' loss and the actor's (NaN without the actor)
         """
         # Drawn even where it is clipped to nothing (DDPG), so that torch's generator ends where SB3 leaves it.
-        noise = th.empty_like(data.actions).normal_(0, model.target_policy_noise)
-        n = len(noise)
-        noise_rows, dones = _rows(noise, n, self._n_actions), _rows(data.dones, n, 1)
-        discount = np.float32(model.gamma) if data.discounts is None else _rows(data.discounts, n, 1)
+        noise, n = th.empty_like(data.actions).normal_(0, model.target_policy_noise), len(data.actions)
+        # What else there is to work out is a few numbers, for which torch's calls take longer than NumPy's
+        discounts = np.float32(model.gamma) if data.discounts is None else _rows(data.discounts, n, 1)
         batch = (
             _rows(data.observations, n, self._n_observations),
             _rows(data.actions, n, self._n_actions),
             _rows(data.next_observations, n, self._n_observations),
-            noise_rows.clip(-model.target_noise_clip, model.target_noise_clip),
+            _rows(noise, n, self._n_actions).clip(-model.target_noise_clip, model.target_noise_clip),
             _rows(data.rewards, n, 1),
-            (np.float32(1) - dones) * discount,
+            (np.float32(1) - _rows(data.dones, n, 1)) * discounts,
         )
         tau = model.tau if with_actor else 0.0
         actor_rates, critic_rates = (_rates(optimizer, tau) for optimizer in self._optimizers)
