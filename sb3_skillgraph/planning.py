@@ -31,6 +31,9 @@ LEAST = 1e-6
 #: Opinions of how well options do, in standard deviations: two thirds as far apart as the fifths of a normal distribution,
 #: since some of what is not known of each is its own and evens out.
 OPINIONS = (-0.84, -0.34, 0.0, 0.34, 0.84)
+#: Runs, of all walks together, with which opinions lie twice as far apart: then nearly all is guessed, by one model of untried
+#: walks, and what is wrong with it evens out no more. At most so many times as far: then any rate is some opinion.
+FEW_RUNS, FARTHEST = 10.0, 3.0
 
 
 class Linear(NamedTuple):
@@ -272,7 +275,7 @@ class Planner:
 
         How well options do is not known for sure, and where they do worse than expected they do so again and again, all of
         them: the walker is then not as good. So the probability is worked out for several opinions of it, from the worst
-        to the best, and averaged.
+        to the best, and averaged; where there have hardly been any runs they lie further apart.
 
         :param solution: the solution that choices are made by
         :param first: the row, among those of the episode, of the choice at the start
@@ -283,8 +286,9 @@ class Planner:
         best = solution.best(first)
         policy = solution.choices.take(best[best >= 0])
         policy = policy.take(self._met(policy, solution.start))
+        apart = min(1.0 + FEW_RUNS / max(self.choice_model.model.n_runs, 1e-9), FARTHEST)
         # By bins of time: who fails and tries again arrives later, perhaps too late
-        curve = np.mean([self._arrival(policy, opinion, solution, remaining) for opinion in OPINIONS], axis=0)
+        curve = np.mean([self._arrival(policy, apart * opinion, solution, remaining) for opinion in OPINIONS], axis=0)
         probability = float(curve[-1])
         if probability < LEAST:
             return LEAST, float(solution.episode_costs[first])

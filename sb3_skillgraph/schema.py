@@ -205,6 +205,7 @@ def _model(n_matched: int) -> Check:
         fastest=number(0.0, 1e9),
         loss=array((2,), low=0.0, high=1.0),
         patience=number(0.0, 1.0),
+        n_runs=number(0.0, MOST),
         version=whole(),
     )
 

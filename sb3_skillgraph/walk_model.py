@@ -102,6 +102,7 @@ class WalkModel:
         self.fastest = 0.0  # steps that the fastest walks take for a radius
         self.loss = np.array([HASTY_LOSS, 0.0])
         self.patience = 1.0  # share of the steps it may take that a failed run takes: less where agents come to stand still
+        self.n_runs = 0.0  # weight of the runs that it was learned from
         self.version = 0  # rises with every change
 
     def success(self, kind: Kind) -> np.ndarray:
@@ -127,7 +128,8 @@ class WalkModel:
         :param failures: weight of those that failed
         :param success_steps: sum of the steps of the successful ones, weighted likewise
         """
-        if not (successes + failures > 0.0).any():
+        self.n_runs = float((successes + failures).sum())
+        if not self.n_runs:
             return
         self._fit_pace(kind, successes, success_steps)
         self._fit_success(kind, successes, failures)

@@ -846,6 +846,20 @@ def test_less_time_promises_less() -> None:
     assert promised[-1] == pytest.approx(0.3 / (1.0 - 0.7 * (1.0 - 0.7 * FOR_GOOD)), abs=0.01)
 
 
+@pytest.mark.parametrize(("guess", "sign"), [(0.95, -1.0), (0.05, 1.0)])
+def test_where_there_have_hardly_been_runs_promises_are_less_sure(guess: float, sign: float) -> None:
+    planner, solution = solve(2, Given.of([(3, 2, guess, 10.0, [(NOWHERE, 1.0)])]))
+    none = np.zeros(1)
+    untried = solution._replace(
+        episode=solution.episode._replace(successes=none, failures=none, loss=np.ones(1), weight=np.zeros((1, MAX_LANDINGS)))
+    )
+    promised = []
+    for n_runs in (0.0, 10.0, 1_000.0):
+        planner.choice_model.model.n_runs = n_runs
+        promised.append(planner.promise(untried, 0, 500.0)[0])
+    assert all(sign * nearer > sign * further + 0.01 for nearer, further in pairwise(promised))
+
+
 @pytest.mark.parametrize("remaining", [1.0, 5.0, 9.0])
 def test_nothing_is_impossible(remaining: float) -> None:
     planner, solution = solve(2, Given.of([(3, 2, 0.3, 10.0, [(3, 1.0)])]))
