@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sb3_skillgraph.graph import SkillGraph
-from sb3_skillgraph.learning.salience import MARGIN, FrontierSalience, RandomSalience, box_around
+from sb3_skillgraph.learning.salience import MARGIN, MARGIN_SHARE, FrontierSalience, RandomSalience, box_around
 from sb3_skillgraph.metric import Ball
 
 RADIUS = 0.5
@@ -27,8 +27,9 @@ def test_frontier_proposes_points_in_the_box_around_what_was_visited(seed: int, 
     centers = rng.normal(0.0, 5.0, (n_events, goal_dim))
     salience = FrontierSalience(graph_of(*map(tuple, centers)))
     lower, upper = box_around(centers, Ball(RADIUS))
-    np.testing.assert_allclose(lower, centers.min(axis=0) - MARGIN * RADIUS)
-    np.testing.assert_allclose(upper, centers.max(axis=0) + MARGIN * RADIUS)
+    for low, high, least, most in zip(lower, upper, centers.min(axis=0), centers.max(axis=0), strict=True):
+        margin = max(MARGIN * RADIUS, MARGIN_SHARE * (most - least))
+        assert (low, high) == (pytest.approx(least - margin), pytest.approx(most + margin))
     for _ in range(20):
         proposed = salience.propose(rng)
         assert proposed is not None
@@ -45,9 +46,9 @@ def test_frontier_reaches_all_of_the_box_and_grows_with_the_graph() -> None:
         points = np.array([salience.propose(rng) for _ in range(500)])
         return [*points.min(axis=0), *points.max(axis=0)]
 
-    assert extent() == pytest.approx([-1.0, -1.0, 21.0, 1.0], abs=0.3)
+    assert extent() == pytest.approx([-2.0, -1.0, 22.0, 1.0], abs=0.3)
     graph.add_event(np.array([0.0, 10.0]), salient=True)
-    assert extent() == pytest.approx([-1.0, -1.0, 21.0, 11.0], abs=0.3)
+    assert extent() == pytest.approx([-2.0, -1.0, 22.0, 11.0], abs=0.3)
 
 
 def test_frontier_proposes_nothing_before_anything_was_visited() -> None:

@@ -15,10 +15,12 @@ from sb3_skillgraph.running import Run
 MAX_FAILURES = 3
 #: Share of the missions that explore; the others travel to any event. Fewer explorations make a worse walker.
 EXPLORE = 0.9
-#: Proposals of which an exploration takes the one whose nearest event has been visited least.
-N_PROPOSALS = 3
-#: Share of the explorations that go on towards the proposed point; the others walk at random.
-TOWARDS = 0.5
+#: Proposals of which an exploration takes the one whose nearest event has been visited least: at least, and one for so many
+#: events, so that in a large graph, too, one of them lies where it ends, and not only behind some wall within it.
+LEAST_PROPOSALS, EVENTS_PER_PROPOSAL = 3, 20
+#: Share of the explorations that go on towards the proposed point; the others walk at random, which bodies with legs hardly
+#: get anywhere by.
+TOWARDS = 0.8
 #: Share of the missions that look for a way to a goal which adaptation is for, while nobody has been there, rather than go
 #: straight there; of those the share that sets out from the event nearest to it: often, but what lies nearest may be the far
 #: side of a wall.
@@ -205,7 +207,8 @@ class Missions(Agenda):
         Of some proposals it is the one whose event has been visited least.
         """
         # Travel to where the graph ends before a proposed point, and explore from there
-        proposals = [self.salience.propose(self.rng) for _ in range(N_PROPOSALS)]
+        n = max(LEAST_PROPOSALS, len(self.graph.events) // EVENTS_PER_PROPOSAL)
+        proposals = [self.salience.propose(self.rng) for _ in range(n)]
         points = [proposal for proposal in proposals if proposal is not None]
         if not points:
             return self._random_walk(point)

@@ -8,8 +8,9 @@ import numpy as np
 from sb3_skillgraph.graph import SkillGraph
 from sb3_skillgraph.metric import Metric
 
-#: Event radii by which the box around everything visited is grown: what lies just outside is worth a look.
-MARGIN = 2.0
+#: The box around everything visited is grown by so many event radii, or by this share of its side, if that is more: what lies
+#: just outside is worth a look, and a passage which leads out of a large box is to be nearest to more than a few proposals.
+MARGIN, MARGIN_SHARE = 2.0, 0.1
 
 
 class Salience(Protocol):
@@ -63,5 +64,6 @@ def box_around(points: np.ndarray, metric: Metric) -> tuple[np.ndarray, np.ndarr
     :param points: shape ``(n, goal_dim)``
     :param metric: of goal space
     """
-    margin = MARGIN * metric.reach(points.shape[1])
-    return points.min(axis=0) - margin, points.max(axis=0) + margin
+    low, high, reach = points.min(axis=0), points.max(axis=0), metric.reach(points.shape[1])
+    margin = np.maximum(MARGIN * reach, np.where(reach > 0.0, MARGIN_SHARE * (high - low), 0.0))
+    return low - margin, high + margin
