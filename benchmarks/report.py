@@ -287,7 +287,7 @@ def readme_table() -> str:
         ("point_mazes", ("medium", "hard")),
         ("kept", ("key-door",)),
         ("foreign", ("fetch-reach", "panda-reach", "point-large", "ant-umaze-v5")),
-        ("ants", ("ant-umaze", "ant-medium")),
+        ("ants", ("ant-umaze", "ant-medium", "ant-large")),
     ):
         rows = {(row["environment"], row["method"]): row for row in summary(plan)}
         for environment in shown:
