@@ -10,7 +10,15 @@ from sb3_skillgraph.choice_model import ChoiceModel
 from sb3_skillgraph.graph import SkillGraph
 from sb3_skillgraph.learning import missions as missions_module
 from sb3_skillgraph.learning.growth import Growth
-from sb3_skillgraph.learning.missions import LEAST_TOWARDS, MAX_FAILURES, Mission, Missions
+from sb3_skillgraph.learning.missions import (
+    EVENTS_PER_PROPOSAL,
+    LEAST_PROPOSALS,
+    LEAST_TOWARDS,
+    MAX_FAILURES,
+    MOST_TOWARDS,
+    Mission,
+    Missions,
+)
 from sb3_skillgraph.learning.rollout import HOLD, Rollout
 from sb3_skillgraph.learning.salience import MARGIN, FrontierSalience, RandomSalience, box_around
 from sb3_skillgraph.learning.witness import Witness
@@ -178,6 +186,17 @@ def test_missions_explore_from_the_event_nearest_to_a_proposal_towards_it_or_at_
         np.testing.assert_allclose(beyond, np.array([9.0, 2.0]) + BEYOND * way / np.linalg.norm(way))
     assert not any(mission.exploring for mission in found)
     assert 0.3 < np.mean([mission.clean for mission in found]) < 0.7
+
+
+def test_in_a_large_graph_explorations_are_chosen_among_more_proposals_and_walk_at_random_less() -> None:
+    graph = line_graph(100)
+    missions = make_missions(graph, *((4.0 * i, 2.0) for i in range(100)))
+    explorations = [mission for mission in drawn(missions, 400) if mission.explore_steps]
+    n = len(graph.events) // EVENTS_PER_PROPOSAL
+    assert n > LEAST_PROPOSALS
+    assert missions.salience.n_proposals == n * len(explorations)  # type: ignore[attr-defined]
+    towards = [mission for mission in explorations if mission.beyond is not None]
+    assert len(towards) / len(explorations) == pytest.approx(MOST_TOWARDS, abs=0.07)
 
 
 def test_of_several_proposals_the_one_that_was_visited_least_is_taken() -> None:
