@@ -13,7 +13,6 @@ from sb3_skillgraph.learning.growth import Growth
 from sb3_skillgraph.learning.missions import (
     EVENTS_PER_PROPOSAL,
     LEAST_PROPOSALS,
-    LEAST_TOWARDS,
     MAX_FAILURES,
     MOST_TOWARDS,
     Mission,
@@ -180,7 +179,7 @@ def test_missions_explore_from_the_event_nearest_to_a_proposal_towards_it_or_at_
     assert {tuple(mission.goal) for mission in explorations} == {(8.0, 0.0)}
     assert {tuple(mission.goal) for mission in travels} == {tuple(center) for center in graph.centers}
     towards = [mission.beyond for mission in explorations if mission.beyond is not None]
-    assert abs(len(towards) / len(explorations) - LEAST_TOWARDS) < 0.15  # of so few events
+    assert 0.35 < len(towards) / len(explorations) < 0.65
     way = np.array([1.0, 2.0])
     for beyond in towards:
         np.testing.assert_allclose(beyond, np.array([9.0, 2.0]) + BEYOND * way / np.linalg.norm(way))
