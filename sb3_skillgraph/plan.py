@@ -77,8 +77,9 @@ def next_best(runner: Runner, point: np.ndarray, goal: np.ndarray) -> Plan | Non
 
 
 def _beginning_with(runner: Runner, solution: Solution, first: int, goal: np.ndarray, remaining: float) -> Plan:
-    probability, steps = runner.planner.promise(solution, first, remaining)
-    return Plan(_status(runner, goal), _ids(runner, solution, runner.planner.path(solution, first)), steps, probability)
+    status = _status(runner, goal)
+    probability, steps = runner.planner.promise(solution, first, remaining, outside=status == "outside")
+    return Plan(status, _ids(runner, solution, runner.planner.path(solution, first)), steps, probability)
 
 
 def _ids(runner: Runner, solution: Solution, path: list[tuple[int, int]]) -> tuple[str, ...]:

@@ -26,6 +26,8 @@ TIME_BINS = 200
 #: Share of the failures that will happen again and again, of an option that always fails: what a policy without noise cannot
 #: do from some place it never can. Of one that seldom fails it is less, in proportion.
 FOR_GOOD = 0.06
+#: The same of walks to a goal where nobody has ever been: often there is a wall before it.
+FOR_GOOD_OUTSIDE = 0.3
 #: Probability that a plan promises at least: nothing is impossible.
 LEAST = 1e-6
 #: Opinions of how well options do, in standard deviations: two thirds as far apart as the fifths of a normal distribution,
@@ -270,7 +272,7 @@ class Planner:
             steps.append((target, vertex))
         return [*steps, (solution.goal, solution.goal)]  # nothing leads on from there but to walk to the goal
 
-    def promise(self, solution: Solution, first: int, remaining: float) -> tuple[float, float]:
+    def promise(self, solution: Solution, first: int, remaining: float, outside: bool = False) -> tuple[float, float]:
         """Tell what a plan is worth, by what is expected of options rather than what is counted on.
 
         How well options do is not known for sure, and where they do worse than expected they do so again and again, all of
@@ -280,6 +282,7 @@ class Planner:
         :param solution: the solution that choices are made by
         :param first: the row, among those of the episode, of the choice at the start
         :param remaining: environment steps that are left
+        :param outside: whether the goal lies where nobody has been
         :return: probability that the goal is reached within them, and expected steps if it is (the plan's cost, where that is
             next to impossible)
         """
@@ -287,8 +290,10 @@ class Planner:
         policy = solution.choices.take(best[best >= 0])
         policy = policy.take(self._met(policy, solution.start))
         apart = min(1.0 + FEW_RUNS / max(self.choice_model.model.n_runs, 1e-9), FARTHEST)
+        for_good = np.where(outside & (policy.target == solution.goal), FOR_GOOD_OUTSIDE, FOR_GOOD)
         # By bins of time: who fails and tries again arrives later, perhaps too late
-        curve = np.mean([self._arrival(policy, apart * opinion, solution, remaining) for opinion in OPINIONS], axis=0)
+        arrivals = [self._arrival(policy, apart * opinion, for_good, solution, remaining) for opinion in OPINIONS]
+        curve = np.mean(arrivals, axis=0)
         probability = float(curve[-1])
         if probability < LEAST:
             return LEAST, float(solution.episode_costs[first])
@@ -307,11 +312,14 @@ class Planner:
                 return np.flatnonzero(met)
             met = more
 
-    def _arrival(self, policy: Choices, stance: float, solution: Solution, remaining: float) -> np.ndarray:
+    def _arrival(
+        self, policy: Choices, stance: float, for_good: np.ndarray, solution: Solution, remaining: float
+    ) -> np.ndarray:
         """Return the probability to have arrived at the goal from the start, within each number of time bins.
 
         :param policy: the choice at each vertex
         :param stance: an opinion of how well options do
+        :param for_good: share of the failures of each that happen again and again, if it always fails
         :param solution: says which vertices are goal and start
         :param remaining: environment steps of all bins together
         """
@@ -319,7 +327,7 @@ class Planner:
         landing, share = policy.landings()
         success = policy.success(stance)
         ends = np.concatenate([policy.target[:, None], landing], axis=1) % n
-        share = (1.0 - FOR_GOOD * (1.0 - success))[:, None] * share  # the rest is lost
+        share = (1.0 - for_good * (1.0 - success))[:, None] * share  # the rest is lost
         weight = np.concatenate([success[:, None], (1.0 - success)[:, None] * share], axis=1)
         failed = np.repeat(policy.failed_steps[:, None], landing.shape[1], axis=1)
         # A run takes one bin at least, and otherwise its steps: between two bins it counts for both in proportion.

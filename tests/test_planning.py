@@ -18,7 +18,7 @@ from sb3_skillgraph.choices import EXPECTED, GUESS_RUNS, NO_RUNS, OPTIMISTIC, PE
 from sb3_skillgraph.edges import MAX_LANDINGS, NOWHERE
 from sb3_skillgraph.graph import SkillGraph
 from sb3_skillgraph.plan import Plan, describe
-from sb3_skillgraph.planning import FOR_GOOD, LEAST, LOST_HORIZONS, Planner, Solution
+from sb3_skillgraph.planning import FOR_GOOD, FOR_GOOD_OUTSIDE, LEAST, LOST_HORIZONS, Planner, Solution
 from sb3_skillgraph.runner import Runner
 from sb3_skillgraph.running import RunnerState
 from sb3_skillgraph.walk_model import FIRST_GUESS, WalkModel, timeout
@@ -844,6 +844,15 @@ def test_less_time_promises_less() -> None:
     assert promised == sorted(promised)
     assert promised[0] == pytest.approx(0.3, abs=0.01)
     assert promised[-1] == pytest.approx(0.3 / (1.0 - 0.7 * (1.0 - 0.7 * FOR_GOOD)), abs=0.01)
+
+
+def test_a_walk_to_where_nobody_has_been_that_fails_fails_more_often_for_good() -> None:
+    rows = [(3, 0, 0.5, 10.0, [(3, 1.0)]), (0, 2, 0.3, 10.0, [(0, 1.0)])]
+    planner, solution = solve(2, Given.of(rows))
+    # The walk to the goal alone: who has not got to where it begins tries again as ever
+    for outside, for_good in ((False, FOR_GOOD), (True, FOR_GOOD_OUTSIDE)):
+        expected = 0.5 / (1.0 - 0.5 * (1.0 - 0.5 * FOR_GOOD)) * 0.3 / (1.0 - 0.7 * (1.0 - 0.7 * for_good))
+        assert planner.promise(solution, 0, 4_000.0, outside)[0] == pytest.approx(expected, abs=0.01)
 
 
 @pytest.mark.parametrize(("guess", "sign"), [(0.95, -1.0), (0.05, 1.0)])

@@ -18,8 +18,8 @@ EXPLORE = 0.9
 #: Proposals of which an exploration takes the one whose nearest event has been visited least: at least, and one for so many
 #: events, so that in a large graph, too, one of them lies where it ends, and not only behind some wall within it.
 LEAST_PROPOSALS, EVENTS_PER_PROPOSAL = 3, 20
-#: Share of the explorations that go on towards the proposed point, in a graph of so few events or less, and of so many or more.
-#: The others walk at random, which finds what is near and teaches a walker much, but comes to nothing new in a large graph.
+#: Share of the explorations that go on towards the proposed point, in a graph of so few events, and of so many or more. The
+#: others walk at random, which finds what is near and teaches a walker much, but comes to nothing new in a large graph.
 LEAST_TOWARDS, MOST_TOWARDS, FEW_EVENTS, MANY_EVENTS = 0.5, 0.8, 50, 100
 #: Share of the missions that look for a way to a goal which adaptation is for, while nobody has been there, rather than go
 #: straight there; of those the share that sets out from the event nearest to it: often, but what lies nearest may be the far
