@@ -205,6 +205,25 @@ def test_of_several_proposals_the_one_that_was_visited_least_is_taken() -> None:
     assert {tuple(mission.goal) for mission in found if mission.explore_steps} == {(4.0, 0.0)}
 
 
+def test_where_explorations_keep_finding_nothing_others_begin_further_away() -> None:
+    """What lies beyond a wall is explored from its other side in the end, and from where something was found again."""
+    graph = line_graph(3)
+    missions = make_missions(graph, (0.0, 3.0))
+    departures = []
+    for _ in range(20):
+        missions.cut(1)
+        mission = next(mission for mission in drawn(missions, 100) if mission.explore_steps)
+        departures.append(graph.index(mission.begins_in))
+        missions.current[0] = mission
+        missions.observe(0, mission.goal, None, False)  # it arrives
+        assert mission.exploring
+    assert departures[0] == 0
+    assert set(departures) == {0, 1, 2}
+    assert departures.count(0) > departures.count(1) > departures.count(2)
+    missions.discovered(0)
+    assert graph.barren[graph.index(mission.begins_in)] == 0.0
+
+
 def test_without_proposals_the_agent_walks_at_random(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(missions_module, "EXPLORE", 1.0)
     assert all(mission.random_walk and not mission.clean for mission in drawn(make_missions(line_graph(2)), 20))

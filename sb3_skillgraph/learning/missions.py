@@ -38,6 +38,7 @@ class Mission:
     :param goal: where it travels over the graph, shape ``(goal_dim,)``
     :param explore_steps: environment steps to explore on arrival
     :param beyond: the point to explore towards; None for a random walk
+    :param begins_in: id of the event that the exploration is to begin in; empty for anywhere
     :param exploring: whether exploration has begun
     :param n_failures: failed runs on the way
     :param clean: whether the policy acts without noise, as it does in ``predict``, so that runs tell what it can do
@@ -46,6 +47,7 @@ class Mission:
     goal: np.ndarray
     explore_steps: int = 0
     beyond: np.ndarray | None = None
+    begins_in: str = ""
     exploring: bool = False
     n_failures: int = 0
     clean: bool = False
@@ -170,6 +172,7 @@ class Missions(Agenda):
         mission = self.current[env]
         if mission is not None and mission.exploring:
             mission.explore_steps = self.exploration_steps
+            self.graph.explored(mission.begins_in, found=True)
 
     def _over(self, mission: Mission, point: np.ndarray) -> bool:
         """Whether a mission is over; an exploration begins on arrival, and ends after its steps."""
@@ -181,6 +184,8 @@ class Missions(Agenda):
             # Who cannot travel yet explores where it is: standing before a wall teaches nothing.
             mission.beyond, mission.explore_steps, arrived = None, self.exploration_steps, True
         mission.exploring = arrived and mission.explore_steps > 0
+        if mission.exploring:
+            self.graph.explored(mission.begins_in, found=False)
         return arrived and not mission.exploring
 
     # -- choosing -----------------------------------------------------------------------------------------------------
@@ -202,7 +207,7 @@ class Missions(Agenda):
         return Mission(self.graph.centers[self.rng.integers(len(self.graph.events))].copy())
 
     def _explore(self, point: np.ndarray) -> Mission:
-        """Go to the event nearest to a proposed point, and on towards it or at random.
+        """Go to an event near a proposed point, and on towards it or at random.
 
         Of some proposals it is the one whose event has been visited least.
         """
@@ -213,16 +218,25 @@ class Missions(Agenda):
         if not points:
             return self._random_walk(point)
         # Of several, the one that lies where the agent has been least: there is most to find
-        nearest = [int(self.graph.distances(proposal).argmin()) for proposal in points]
-        rarest = int(np.argmin(self.graph.visits[nearest]))
-        return self._beyond(nearest[rarest], points[rarest])
+        departures = [self._departure(proposal) for proposal in points]
+        rarest = int(np.argmin(self.graph.visits[departures]))
+        return self._beyond(departures[rarest], points[rarest])
+
+    def _departure(self, point: np.ndarray) -> int:
+        """Return the event to explore towards a point from.
+
+        It is the nearest one; but where explorations have kept finding nothing a wall may stand between the two, and the way
+        may begin further away: each counts as if it had been so much more distant, by the root of their number.
+        """
+        n_barren = self.graph.barren[: len(self.graph.events)]
+        return int((self.graph.distances(point) * np.sqrt(1.0 + n_barren)).argmin())
 
     def _beyond(self, event: int, point: np.ndarray) -> Mission:
-        goal = self.graph.centers[event].copy()
+        goal, begins_in = self.graph.centers[event].copy(), self.graph.id(event)
         towards = np.interp(len(self.graph.events), (FEW_EVENTS, MANY_EVENTS), (LEAST_TOWARDS, MOST_TOWARDS))
         if self.rng.random() >= towards:
-            return Mission(goal, self.exploration_steps)
-        return Mission(goal, self.exploration_steps, self._past(goal, point))
+            return Mission(goal, self.exploration_steps, None, begins_in)
+        return Mission(goal, self.exploration_steps, self._past(goal, point), begins_in)
 
     def _past(self, begin: np.ndarray, point: np.ndarray) -> np.ndarray:
         """Return where an exploration that begins somewhere goes for a proposed point: as far past it as is wanted."""
@@ -237,10 +251,10 @@ class Missions(Agenda):
         return Mission(goal.copy())
 
     def _look_for(self, goal: np.ndarray) -> Mission:
-        """Go to the event nearest to the goal, or to any other place that nobody knows, and on from there."""
+        """Go to an event near the goal, or near any other place that nobody knows, and on from there."""
         place = goal
         if self.rng.random() >= FROM_NEAREST:
             box = box_around(np.concatenate([self.graph.centers, goal[None]]), self.graph.metric)
             points = self.rng.uniform(*box, (N_DRAWN, self.graph.goal_dim))
             place = next((point for point in points if self.graph.locate(point) == NOWHERE), goal)
-        return self._beyond(int(self.graph.distances(place).argmin()), place)
+        return self._beyond(self._departure(place), place)
