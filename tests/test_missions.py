@@ -12,7 +12,9 @@ from sb3_skillgraph.learning import missions as missions_module
 from sb3_skillgraph.learning.growth import Growth
 from sb3_skillgraph.learning.missions import (
     EVENTS_PER_PROPOSAL,
+    FEW_EVENTS,
     LEAST_PROPOSALS,
+    MANY_EVENTS,
     MAX_FAILURES,
     MOST_TOWARDS,
     Mission,
@@ -205,23 +207,32 @@ def test_of_several_proposals_the_one_that_was_visited_least_is_taken() -> None:
     assert {tuple(mission.goal) for mission in found if mission.explore_steps} == {(4.0, 0.0)}
 
 
-def test_where_explorations_keep_finding_nothing_others_begin_further_away() -> None:
-    """What lies beyond a wall is explored from its other side in the end, and from where something was found again."""
-    graph = line_graph(3)
-    missions = make_missions(graph, (0.0, 3.0))
-    departures = []
+def departures(n_events: int) -> tuple[Missions, list[int]]:
+    """Where explorations begin of a point beside the first event, one after another, of which none finds anything."""
+    missions = make_missions(line_graph(n_events), (0.0, 3.0))
+    events = []
     for _ in range(20):
         missions.cut(1)
         mission = next(mission for mission in drawn(missions, 100) if mission.explore_steps)
-        departures.append(graph.index(mission.begins_in))
+        events.append(missions.graph.index(mission.begins_in))
         missions.current[0] = mission
         missions.observe(0, mission.goal, None, False)  # it arrives
         assert mission.exploring
-    assert departures[0] == 0
-    assert set(departures) == {0, 1, 2}
-    assert departures.count(0) > departures.count(1) > departures.count(2)
+    return missions, events
+
+
+def test_in_a_large_graph_explorations_that_keep_finding_nothing_begin_further_away() -> None:
+    """What lies beyond a wall is explored from its other side in the end, and from where something was found again."""
+    missions, events = departures(MANY_EVENTS)
+    assert events[0] == 0
+    assert set(events) == {0, 1, 2}
+    assert events.count(0) > events.count(1) > events.count(2)
     missions.discovered(0)
-    assert graph.barren[graph.index(mission.begins_in)] == 0.0
+    assert missions.graph.barren[events[-1]] == 0.0
+
+
+def test_in_a_small_graph_explorations_begin_in_the_nearest_event() -> None:
+    assert set(departures(FEW_EVENTS)[1]) == {0}
 
 
 def test_without_proposals_the_agent_walks_at_random(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -18,9 +18,11 @@ EXPLORE = 0.9
 #: Proposals of which an exploration takes the one whose nearest event has been visited least: at least, and one for so many
 #: events, so that in a large graph, too, one of them lies where it ends, and not only behind some wall within it.
 LEAST_PROPOSALS, EVENTS_PER_PROPOSAL = 3, 20
-#: Share of the explorations that go on towards the proposed point, in a graph of so few events, and of so many or more. The
-#: others walk at random, which finds what is near and teaches a walker much, but comes to nothing new in a large graph.
-LEAST_TOWARDS, MOST_TOWARDS, FEW_EVENTS, MANY_EVENTS = 0.5, 0.8, 50, 100
+#: Events of a small graph, and of a large one. In a small one all is near: the best exploration is what teaches the walker most.
+FEW_EVENTS, MANY_EVENTS = 50, 100
+#: Share of the explorations that go on towards the proposed point, in a small graph and in a large one. The others walk at
+#: random, which finds what is near and teaches a walker much, but comes to nothing new in a large graph.
+LEAST_TOWARDS, MOST_TOWARDS = 0.5, 0.8
 #: Share of the missions that look for a way to a goal which adaptation is for, while nobody has been there, rather than go
 #: straight there; of those the share that sets out from the event nearest to it: often, but what lies nearest may be the far
 #: side of a wall.
@@ -226,15 +228,19 @@ class Missions(Agenda):
         """Return the event to explore towards a point from.
 
         It is the nearest one; but where explorations have kept finding nothing a wall may stand between the two, and the way
-        may begin further away: each counts as if it had been so much more distant, by the root of their number.
+        may begin further away: in a large graph they count as distance, by the root of their number.
         """
-        n_barren = self.graph.barren[: len(self.graph.events)]
+        n_barren = self._largeness * self.graph.barren[: len(self.graph.events)]
         return int((self.graph.distances(point) * np.sqrt(1.0 + n_barren)).argmin())
+
+    @property
+    def _largeness(self) -> float:
+        """From 0, of a small graph, to 1, of a large one."""
+        return float(np.interp(len(self.graph.events), (FEW_EVENTS, MANY_EVENTS), (0.0, 1.0)))
 
     def _beyond(self, event: int, point: np.ndarray) -> Mission:
         goal, begins_in = self.graph.centers[event].copy(), self.graph.id(event)
-        towards = np.interp(len(self.graph.events), (FEW_EVENTS, MANY_EVENTS), (LEAST_TOWARDS, MOST_TOWARDS))
-        if self.rng.random() >= towards:
+        if self.rng.random() >= LEAST_TOWARDS + self._largeness * (MOST_TOWARDS - LEAST_TOWARDS):
             return Mission(goal, self.exploration_steps, None, begins_in)
         return Mission(goal, self.exploration_steps, self._past(goal, point), begins_in)
 
