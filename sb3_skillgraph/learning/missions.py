@@ -18,7 +18,7 @@ EXPLORE = 0.9
 #: Proposals of which an exploration takes the one whose nearest event has been visited least: at least, and one for so many
 #: events, so that in a large graph, too, one of them lies where it ends, and not only behind some wall within it.
 LEAST_PROPOSALS, EVENTS_PER_PROPOSAL = 3, 20
-#: Events of a small graph, and of a large one. In a small one all is near: the best exploration is what teaches the walker most.
+#: Events of a small graph, and of a large one. In a small one all is near: best is what teaches the walker most.
 FEW_EVENTS, MANY_EVENTS = 50, 100
 #: Share of the explorations that go on towards the proposed point, in a small graph and in a large one. The others walk at
 #: random, which finds what is near and teaches a walker much, but comes to nothing new in a large graph.
