@@ -44,6 +44,7 @@ OGBENCH = {
     "giant-100": "giant, episodes of 100 steps from anywhere",
     "giant-200": "giant, episodes of 200 steps from anywhere",
     "ant-medium": "`antmaze-medium-v0`",
+    "ant-teleport": "`antmaze-teleport-v0`",
 }
 #: Success of the best published method on OGBench's tasks, learned offline from its data.
 PUBLISHED = {"medium": 0.91, "large": 0.88, "giant": 0.92, "teleport": 0.57}
@@ -294,7 +295,7 @@ def readme_table() -> str:
             ours = rows[environment, "skill-graph"]
             lines.append((TASKS[environment], str(ours["steps"]), rate(ours), *beside(rows, environment, "mean")))
     official = {(row["environment"], row["method"]): row for row in [*summary("ogbench"), *summary("ogbench_ants")]}
-    for environment in ("giant", "teleport", "ant-medium"):
+    for environment in ("giant", "teleport", "ant-medium", "ant-teleport"):
         ours = official[environment, "skill-graph"]
         success = f"{ours['task_success_rate']:.3f}{lone(ours)}"
         if environment in PUBLISHED:
