@@ -35,6 +35,7 @@ TASKS = {
     "ant-reacher": "Ant, open floor",
     "ant-medium": "Ant, Medium",
     "ant-large": "Ant, Large",
+    "ant-teleport": "Ant, teleporters",
 }
 OGBENCH = {
     "medium": "`pointmaze-medium-v0`",
