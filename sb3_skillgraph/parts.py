@@ -130,7 +130,7 @@ class Parts:
         planner = Planner(graph, model, horizon(agent.env))
         skills = Skills(graph, factory, walker)
         average = AveragedPolicy(walker.learner)  # what predict acts by
-        runner = Runner(graph, planner, average.actor, view, skills)
+        runner = Runner(graph, planner, average.actor, view, skills, second=walker.actor)
         missions = Missions(
             graph,
             find_salience(arguments, graph, store, agent),
@@ -219,12 +219,13 @@ class Parts:
         """Turn actions in [-1, 1], shape ``(n, action_dim)``, into the environment's own, shape ``(n, *action_shape)``."""
         return self.factory.unscale(scaled).reshape(len(scaled), *self.factory.action_space.shape)
 
-    def walk(self, observation: dict[str, np.ndarray], goals: np.ndarray) -> np.ndarray:
+    def walk(self, observation: dict[str, np.ndarray], goals: np.ndarray, failed: bool = False) -> np.ndarray:
         """Return what the walker does.
 
         :param observation: ``observation`` and ``achieved_goal``, shapes ``(n, dim)``
         :param goals: where it is to go, shape ``(n, goal_dim)``
+        :param failed: whether the walk before this one failed
         :return: actions in the environment's own bounds, shape ``(n, *action_shape)``
         """
         seen = self.runner.view(observation["observation"], observation["achieved_goal"], goals)
-        return self.unscale(self.runner.actor.act(seen))
+        return self.unscale(self.runner.walk(seen, np.full(len(seen), failed)))

@@ -53,6 +53,7 @@ class Runner:
     :param view: what a policy sees
     :param skills: the options that have a policy of their own, by their ids
     :param rules: what chooses options in place of the planner, if there is such a thing
+    :param second: the walker's policy in the run after a failed one; None for the same
     """
 
     def __init__(
@@ -63,6 +64,7 @@ class Runner:
         view: View,
         skills: Mapping[str, Option] | None = None,
         rules: Rules | None = None,
+        second: NumpyActor | None = None,
     ) -> None:
         self.graph = graph
         self.planner = planner
@@ -70,6 +72,7 @@ class Runner:
         self.view = view
         self.skills = {} if skills is None else skills
         self.rules = rules
+        self.second = second
 
     # -- one step -----------------------------------------------------------------------------------------------------
 
@@ -147,11 +150,25 @@ class Runner:
             state.steps[i] = state.still[i] = 0
         # All walks act by one network, in one pass for all environments; skills by their own
         seen = self.view(observation["observation"], points, state.aim)
-        actions = self.actor.act(seen)
+        actions = self.walk(seen, state.failed)
         for i, option in enumerate(state.option.tolist() if self.skills else ()):
             if option in self.skills:
                 actions[i] = self.skills[option].actor.act(seen[i : i + 1])[0]
         return actions, state._replace(steps=state.steps + 1, elapsed=state.elapsed + 1)
+
+    def walk(self, seen: np.ndarray, failed: np.ndarray) -> np.ndarray:
+        """Let the walker act.
+
+        What failed by a policy without noise fails there again, whatever is planned: the second policy is another try.
+
+        :param seen: what it sees, shape ``(n_envs, seen_dim)``
+        :param failed: for which environments the run before this one failed, shape ``(n_envs,)``
+        :return: actions scaled to [-1, 1], shape ``(n_envs, action_dim)``
+        """
+        actions = self.actor.act(seen)
+        if self.second is None or not failed.any():
+            return actions
+        return np.where(failed[:, None], self.second.act(seen), actions)
 
     # -- choosing an option -------------------------------------------------------------------------------------------
 

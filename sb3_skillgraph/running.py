@@ -82,6 +82,11 @@ class RunnerState(NamedTuple):
     run_steps: np.ndarray
     run_count: np.ndarray
 
+    @property
+    def failed(self) -> np.ndarray:
+        """For which environments the episode's last run ended, but not in the event it was to lead to; shape ``(n_envs,)``."""
+        return (self.arrived == "") & (self.run_option[:, 0] != "")
+
     @classmethod
     def fresh(cls, n_envs: int, goal_dim: int, observation_dim: int) -> "RunnerState":
         """Return the state at the start of an episode."""

@@ -60,7 +60,8 @@ def agent(monkeypatch: pytest.MonkeyPatch) -> Any:
 def test_predict_acts_by_the_mean_and_learning_does_not(agent: Any) -> None:
     parts = agent.parts
     assert parts.runner.actor is parts.average.actor
-    assert parts.rollout.runner.actor is parts.walker.actor
+    assert parts.rollout.runner.actor is parts.runner.second is parts.walker.actor
+    assert parts.rollout.runner.second is None
     now = np.concatenate([p.detach().numpy().ravel() for p in parts.walker.learner.actor.parameters()])
     assert np.abs(weights(parts.average) - now).max() > 1e-3
 

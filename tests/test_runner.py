@@ -187,6 +187,48 @@ def test_a_walk_to_the_goal_lands_in_the_goal() -> None:
     assert state.arrived[0] == ""
 
 
+class Back:
+    """A policy that does the opposite of the first."""
+
+    def act(self, seen: np.ndarray) -> np.ndarray:
+        return -np.asarray(Straight().act(seen))
+
+
+def test_the_second_policy_has_the_run_after_a_failed_one_and_no_other() -> None:
+    runner = make_runner(known_line())
+    runner.second = Back()  # type: ignore[assignment]
+    goal, at = np.array([[12.0, 0.0]]), np.array([[4.0, 0.0]])
+
+    def heading(state: RunnerState) -> float:
+        return float(runner.act(seen_at(at), goal, state)[0][0, 0])
+
+    fresh = RunnerState.fresh(1, 2, 2)
+    assert heading(fresh) > 0
+    failed, _ = runner.advance(running("w2", began="e1", aim=(8.0, 0.0), steps=20), at)
+    assert heading(failed) < 0
+    _, still_running = runner.act(seen_at(at), goal, failed)
+    assert heading(still_running) < 0  # to its end
+    arrived, _ = runner.advance(running("w1", began="e0", aim=(4.0, 0.0), steps=20), at)
+    assert heading(arrived) > 0
+    runner.second = None
+    assert heading(failed) > 0
+
+
+def test_each_environment_has_the_policy_that_its_own_last_run_asks_for() -> None:
+    runner = make_runner(known_line())
+    runner.second = Back()  # type: ignore[assignment]
+    points, goals = np.array([[4.0, 0.0]] * 2), np.array([[12.0, 0.0]] * 2)
+    fresh = RunnerState.fresh(2, 2, 2)
+    of_first = np.array([True, False])
+    state = fresh._replace(
+        option=np.where(of_first, "w2", fresh.option), aim=np.array([[8.0, 0.0], [0.0, 0.0]], dtype=np.float32)
+    )
+    state, runs = runner.advance(state, points)
+    assert [run.env for run in runs] == [0]
+    actions, _ = runner.act(seen_at(points), goals, state)
+    assert (actions[:, 0] < 0).tolist() == [True, False]
+
+
 def test_where_nothing_runs_nothing_ends() -> None:
     runner = make_runner(known_line())
     state = RunnerState.fresh(3, 2, 2)

@@ -144,7 +144,8 @@ class ReplaySearch:
         else:
             now = self._go_on(observation, SearchState(*state))
         seen = {key: observation[key][None] for key in ("observation", "achieved_goal")}
-        action = self.agent.parts.walk(seen, self._target(observation, now.waypoints)[None])[0]
+        failed = len(now.barred) > 0 and now.begin == self.n_states  # the leg before this one took too long
+        action = self.agent.parts.walk(seen, self._target(observation, now.waypoints)[None], bool(failed))[0]
         return action, tuple(now._replace(left=now.left - 1))
 
     def _begin(self, observation: dict[str, np.ndarray], barred: np.ndarray) -> SearchState:
