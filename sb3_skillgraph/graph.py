@@ -48,6 +48,7 @@ class SkillGraph:
         self._now = 0.0
         self.version = 0  # rises with every change
         self.visits = np.zeros(64)  # of each event
+        self.barren = np.zeros(64)  # explorations from each event, since one found something
         self._centers = np.zeros((64, goal_dim))
         self.walk_ids: list[str] = []  # of the walks to the events, in their order
         self._index: dict[str, int] = {}  # of events, by their ids and by those of the walks to them
@@ -110,9 +111,10 @@ class SkillGraph:
         if i == len(self._centers):
             self._centers = np.concatenate([self._centers, np.zeros_like(self._centers)])
             self.visits = np.concatenate([self.visits, np.zeros_like(self.visits)])
+            self.barren = np.concatenate([self.barren, np.zeros_like(self.barren)])
         self.events.append(event)
         self.walk_ids.append(f"w{self.n_made}")
-        self._centers[i], self.visits[i] = event.center, 0.0
+        self._centers[i], self.visits[i], self.barren[i] = event.center, 0.0, 0.0
         self._index[event.id] = self._index[self.walk_ids[i]] = i
         self.n_made += 1
         self.version += 1
@@ -139,13 +141,13 @@ class SkillGraph:
         return new_index
 
     def _rename(self, kept: list[int], new_index: np.ndarray) -> None:
-        old_edges, visits = self.edges, self.visits[: len(new_index)].copy()
+        old_edges = self.edges
         self.events = [self.events[i] for i in kept]
         self.walk_ids = [self.walk_ids[i] for i in kept]
         self._index = self._build_index()
         self._centers[: len(kept)] = self._centers[kept]
-        self.visits[:] = 0.0
-        np.add.at(self.visits, new_index, visits)
+        for counts in (self.visits, self.barren):
+            counts[:] = np.bincount(new_index, counts[: len(new_index)], len(counts))
         self.edges = Edges()
         for row in range(old_edges.size):
             source, target = int(new_index[old_edges.source[row]]), int(new_index[old_edges.target[row]])
@@ -193,6 +195,16 @@ class SkillGraph:
             edges.crossing_steps[back] = edges.crossing_steps[there]
         edges.backward[back] += 1
         self.version += 1
+
+    def explored(self, event: str, found: bool) -> None:
+        """An exploration has begun in an event, or has found something.
+
+        :param event: its id; one that has been forgotten since, or none, changes nothing
+        :param found: which of the two
+        """
+        index = self.index(event)
+        if index != NOWHERE:
+            self.barren[index] = 0.0 if found else self.barren[index] + 1.0
 
     def ran(self, source: int, target: int, success: bool, landing: int, steps: int) -> None:
         """A run of a walk has ended: the only thing that changes rates.
@@ -313,6 +325,7 @@ class SkillGraph:
             "walks": list(self.walk_ids),
             "edges": self.edges.get_state(),
             "visits": self.visits[: len(self.events)].copy(),
+            "barren": self.barren[: len(self.events)].copy(),
             "cover_radius": self.cover_radius,
             "now": self.now,
             "n_made": self.n_made,
@@ -326,6 +339,7 @@ class SkillGraph:
         self.walk_ids = list(state["walks"])
         self._index = self._build_index()
         self.visits[: len(self.events)] = state["visits"]
+        self.barren[: len(self.events)] = state["barren"]
         self.edges.set_state(state["edges"])
         self.cover_radius, self.now, self.n_made = state["cover_radius"], state["now"], state["n_made"]
         self.version += 1

@@ -174,6 +174,7 @@ def _graph(n_events: int, goal_dim: int) -> Check:
             **dict.fromkeys(("failures", "failure_steps", "updated"), weights),
         ),
         visits=array((n_events,), low=0.0),
+        barren=array((n_events,), low=0.0),
         cover_radius=number(1e-30, HUGE),
         now=number(0.0, MOST),
         n_made=whole(n_events),
@@ -233,7 +234,13 @@ def _rollout(n_envs: int, spec: Any, n_events: int, n_matched: int) -> Check:
     fresh = RunnerState.fresh(n_envs, spec.goal_dim, spec.observation_dim)
     goal = array((spec.goal_dim,))
     mission = entries(
-        goal=goal, explore_steps=whole(-MOST_STEPS), beyond=optional(goal), exploring=flag, n_failures=whole(), clean=flag
+        goal=goal,
+        explore_steps=whole(-MOST_STEPS),
+        beyond=optional(goal),
+        begins_in=text,
+        exploring=flag,
+        n_failures=whole(),
+        clean=flag,
     )
     event, passed = whole(0, max(n_events - 1, 0)), each(whole(), number(0.0), kind=tuple)
     stay = each(event, whole(), whole(), number(0.0), _some(list_of(passed)))

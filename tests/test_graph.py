@@ -316,8 +316,8 @@ def test_what_is_left_after_merging_lies_apart_and_everyone_goes_to_the_nearest(
     graph = SkillGraph(2, 1.0, 100)
     for center in rng.uniform(0.0, 8.0, (n_events, 2)):
         i = graph.add_event(center, salient=bool(rng.random() < 0.2))
-        graph.visits[i] = rng.integers(1, 9)
-    centers, total = graph.centers.copy(), graph.visits[:n_events].sum()
+        graph.visits[i], graph.barren[i] = rng.integers(1, 9, 2)
+    centers, totals = graph.centers.copy(), [counts[:n_events].sum() for counts in (graph.visits, graph.barren)]
     new_index = graph.coarsen()
     between = np.linalg.norm(graph.centers[:, None] - graph.centers, axis=2)
     np.fill_diagonal(between, np.inf)
@@ -326,8 +326,9 @@ def test_what_is_left_after_merging_lies_apart_and_everyone_goes_to_the_nearest(
     distances = np.linalg.norm(centers[:, None] - graph.centers, axis=2)
     np.testing.assert_array_equal(new_index, distances.argmin(axis=1))
     assert distances.min(axis=1).max() < graph.cover_radius  # nobody ends up nowhere
-    assert graph.visits[: len(graph.events)].sum() == total
-    assert not graph.visits[len(graph.events) :].any()
+    for counts, total in zip((graph.visits, graph.barren), totals, strict=True):
+        assert counts[: len(graph.events)].sum() == total
+        assert not counts[len(graph.events) :].any()
 
 
 # -- any history ------------------------------------------------------------------------------------------------------
@@ -423,8 +424,21 @@ def test_a_state_is_no_view_of_the_graph() -> None:
     graph.crossed(0, 1, 20)
     graph.ran(0, 1, False, 0, 9)
     graph.visits[0] += 1
+    graph.explored("e0", found=False)
     graph.add_event(np.ones(2) * 9, salient=True)
     assert same(state, before)
+
+
+def test_explorations_are_counted_until_one_finds_something_and_those_of_forgotten_events_are_not() -> None:
+    graph = line(5, spacing=0.5)
+    for event in ("e0", "e0", "e3", ""):
+        graph.explored(event, found=False)
+    assert graph.barren[:5].tolist() == [2.0, 0.0, 0.0, 1.0, 0.0]
+    graph.coarsen()
+    assert graph.barren[:2].tolist() == [2.0, 1.0]  # of those merged with others, too
+    graph.explored("e3", found=False)  # it is gone
+    graph.explored("e0", found=True)
+    assert graph.barren[:2].tolist() == [0.0, 1.0]
 
 
 def test_ids_of_merged_events_are_not_given_again() -> None:

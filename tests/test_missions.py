@@ -12,7 +12,9 @@ from sb3_skillgraph.learning import missions as missions_module
 from sb3_skillgraph.learning.growth import Growth
 from sb3_skillgraph.learning.missions import (
     EVENTS_PER_PROPOSAL,
+    FEW_EVENTS,
     LEAST_PROPOSALS,
+    MANY_EVENTS,
     MAX_FAILURES,
     MOST_TOWARDS,
     Mission,
@@ -203,6 +205,34 @@ def test_of_several_proposals_the_one_that_was_visited_least_is_taken() -> None:
     graph.visits[:4] = [9.0, 5.0, 7.0, 1.0]
     found = drawn(make_missions(graph, (0.0, 1.0), (4.0, 1.0), (8.0, 1.0)), 100)
     assert {tuple(mission.goal) for mission in found if mission.explore_steps} == {(4.0, 0.0)}
+
+
+def departures(n_events: int) -> tuple[Missions, list[int]]:
+    """Where explorations begin of a point beside the first event, one after another, of which none finds anything."""
+    missions = make_missions(line_graph(n_events), (0.0, 3.0))
+    events = []
+    for _ in range(20):
+        missions.cut(1)
+        mission = next(mission for mission in drawn(missions, 100) if mission.explore_steps)
+        events.append(missions.graph.index(mission.begins_in))
+        missions.current[0] = mission
+        missions.observe(0, mission.goal, None, False)  # it arrives
+        assert mission.exploring
+    return missions, events
+
+
+def test_in_a_large_graph_explorations_that_keep_finding_nothing_begin_further_away() -> None:
+    """What lies beyond a wall is explored from its other side in the end, and from where something was found again."""
+    missions, events = departures(MANY_EVENTS)
+    assert events[0] == 0
+    assert set(events) == {0, 1, 2}
+    assert events.count(0) > events.count(1) > events.count(2)
+    missions.discovered(0)
+    assert missions.graph.barren[events[-1]] == 0.0
+
+
+def test_in_a_small_graph_explorations_begin_in_the_nearest_event() -> None:
+    assert set(departures(FEW_EVENTS)[1]) == {0}
 
 
 def test_without_proposals_the_agent_walks_at_random(monkeypatch: pytest.MonkeyPatch) -> None:

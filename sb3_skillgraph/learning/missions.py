@@ -18,9 +18,14 @@ EXPLORE = 0.9
 #: Proposals of which an exploration takes the one whose nearest event has been visited least: at least, and one for so many
 #: events, so that in a large graph, too, one of them lies where it ends, and not only behind some wall within it.
 LEAST_PROPOSALS, EVENTS_PER_PROPOSAL = 3, 20
-#: Share of the explorations that go on towards the proposed point, in a graph of so few events, and of so many or more. The
-#: others walk at random, which finds what is near and teaches a walker much, but comes to nothing new in a large graph.
-LEAST_TOWARDS, MOST_TOWARDS, FEW_EVENTS, MANY_EVENTS = 0.5, 0.8, 50, 100
+#: Events of a small graph, and of a large one. In a small one all is near: best is what teaches the walker most.
+FEW_EVENTS, MANY_EVENTS = 50, 100
+#: Share of the explorations that go on towards the proposed point, in a small graph and in a large one. The others walk at
+#: random, which finds what is near and teaches a walker much, but comes to nothing new in a large graph.
+LEAST_TOWARDS, MOST_TOWARDS = 0.5, 0.8
+#: Share of the explorations of a large graph that begin further away where nearer ones have found nothing; the others begin in
+#: the event nearest to the point. With all of them ways to travel were shorter, and what trains the walker is travelling.
+FROM_FURTHER = 0.5
 #: Share of the missions that look for a way to a goal which adaptation is for, while nobody has been there, rather than go
 #: straight there; of those the share that sets out from the event nearest to it: often, but what lies nearest may be the far
 #: side of a wall.
@@ -38,6 +43,7 @@ class Mission:
     :param goal: where it travels over the graph, shape ``(goal_dim,)``
     :param explore_steps: environment steps to explore on arrival
     :param beyond: the point to explore towards; None for a random walk
+    :param begins_in: id of the event that the exploration is to begin in; empty for anywhere
     :param exploring: whether exploration has begun
     :param n_failures: failed runs on the way
     :param clean: whether the policy acts without noise, as it does in ``predict``, so that runs tell what it can do
@@ -46,6 +52,7 @@ class Mission:
     goal: np.ndarray
     explore_steps: int = 0
     beyond: np.ndarray | None = None
+    begins_in: str = ""
     exploring: bool = False
     n_failures: int = 0
     clean: bool = False
@@ -170,6 +177,7 @@ class Missions(Agenda):
         mission = self.current[env]
         if mission is not None and mission.exploring:
             mission.explore_steps = self.exploration_steps
+            self.graph.explored(mission.begins_in, found=True)
 
     def _over(self, mission: Mission, point: np.ndarray) -> bool:
         """Whether a mission is over; an exploration begins on arrival, and ends after its steps."""
@@ -181,6 +189,8 @@ class Missions(Agenda):
             # Who cannot travel yet explores where it is: standing before a wall teaches nothing.
             mission.beyond, mission.explore_steps, arrived = None, self.exploration_steps, True
         mission.exploring = arrived and mission.explore_steps > 0
+        if mission.exploring:
+            self.graph.explored(mission.begins_in, found=False)
         return arrived and not mission.exploring
 
     # -- choosing -----------------------------------------------------------------------------------------------------
@@ -202,7 +212,7 @@ class Missions(Agenda):
         return Mission(self.graph.centers[self.rng.integers(len(self.graph.events))].copy())
 
     def _explore(self, point: np.ndarray) -> Mission:
-        """Go to the event nearest to a proposed point, and on towards it or at random.
+        """Go to an event near a proposed point, and on towards it or at random.
 
         Of some proposals it is the one whose event has been visited least.
         """
@@ -213,16 +223,33 @@ class Missions(Agenda):
         if not points:
             return self._random_walk(point)
         # Of several, the one that lies where the agent has been least: there is most to find
-        nearest = [int(self.graph.distances(proposal).argmin()) for proposal in points]
-        rarest = int(np.argmin(self.graph.visits[nearest]))
-        return self._beyond(nearest[rarest], points[rarest])
+        chance = float(self.rng.random())
+        departures = [self._departure(proposal, chance) for proposal in points]
+        rarest = int(np.argmin(self.graph.visits[departures]))
+        return self._beyond(departures[rarest], points[rarest], chance)
 
-    def _beyond(self, event: int, point: np.ndarray) -> Mission:
-        goal = self.graph.centers[event].copy()
-        towards = np.interp(len(self.graph.events), (FEW_EVENTS, MANY_EVENTS), (LEAST_TOWARDS, MOST_TOWARDS))
-        if self.rng.random() >= towards:
-            return Mission(goal, self.exploration_steps)
-        return Mission(goal, self.exploration_steps, self._past(goal, point))
+    def _departure(self, point: np.ndarray, chance: float) -> int:
+        """Return the event to explore towards a point from.
+
+        It is the nearest one; but where explorations have kept finding nothing a wall may stand between the two, and the way
+        may begin further away: for some they count as distance, by the root of their number.
+        """
+        distances = self.graph.distances(point)
+        if chance < FROM_FURTHER * self._largeness:
+            distances = distances * np.sqrt(1.0 + self.graph.barren[: len(distances)])
+        return int(distances.argmin())
+
+    def _beyond(self, event: int, point: np.ndarray, chance: float) -> Mission:
+        """Explore from an event, towards a point if chance wants it so, else at random."""
+        goal, begins_in = self.graph.centers[event].copy(), self.graph.id(event)
+        if chance >= LEAST_TOWARDS + self._largeness * (MOST_TOWARDS - LEAST_TOWARDS):
+            return Mission(goal, self.exploration_steps, None, begins_in)
+        return Mission(goal, self.exploration_steps, self._past(goal, point), begins_in)
+
+    @property
+    def _largeness(self) -> float:
+        """From 0, of a small graph, to 1, of a large one."""
+        return float(np.interp(len(self.graph.events), (FEW_EVENTS, MANY_EVENTS), (0.0, 1.0)))
 
     def _past(self, begin: np.ndarray, point: np.ndarray) -> np.ndarray:
         """Return where an exploration that begins somewhere goes for a proposed point: as far past it as is wanted."""
@@ -237,10 +264,11 @@ class Missions(Agenda):
         return Mission(goal.copy())
 
     def _look_for(self, goal: np.ndarray) -> Mission:
-        """Go to the event nearest to the goal, or to any other place that nobody knows, and on from there."""
+        """Go to an event near the goal, or near any other place that nobody knows, and on from there."""
         place = goal
         if self.rng.random() >= FROM_NEAREST:
             box = box_around(np.concatenate([self.graph.centers, goal[None]]), self.graph.metric)
             points = self.rng.uniform(*box, (N_DRAWN, self.graph.goal_dim))
             place = next((point for point in points if self.graph.locate(point) == NOWHERE), goal)
-        return self._beyond(int(self.graph.distances(place).argmin()), place)
+        chance = float(self.rng.random())
+        return self._beyond(self._departure(place, chance), place, chance)
