@@ -45,10 +45,19 @@ OGBENCH = {
     "giant-100": "giant, episodes of 100 steps from anywhere",
     "giant-200": "giant, episodes of 200 steps from anywhere",
     "ant-medium": "`antmaze-medium-v0`",
+    "ant-large": "`antmaze-large-v0`",
     "ant-teleport": "`antmaze-teleport-v0`",
 }
 #: Success of the best published method on OGBench's tasks, learned offline from its data.
-PUBLISHED = {"medium": 0.91, "large": 0.88, "giant": 0.92, "teleport": 0.57}
+PUBLISHED = {
+    "medium": 0.91,
+    "large": 0.88,
+    "giant": 0.92,
+    "teleport": 0.57,
+    "ant-medium": 0.96,
+    "ant-large": 0.93,
+    "ant-teleport": 0.53,
+}
 
 
 def number(value: float, digits: int = 2) -> str:
