@@ -305,7 +305,7 @@ def readme_table() -> str:
             ours = rows[environment, "skill-graph"]
             lines.append((TASKS[environment], str(ours["steps"]), rate(ours), *beside(rows, environment, "mean")))
     official = {(row["environment"], row["method"]): row for row in [*summary("ogbench"), *summary("ogbench_ants")]}
-    for environment in ("giant", "teleport", "ant-medium", "ant-teleport"):
+    for environment in ("giant", "teleport", "ant-medium", "ant-large", "ant-teleport"):
         ours = official[environment, "skill-graph"]
         success = f"{ours['task_success_rate']:.3f}{lone(ours)}"
         if environment in PUBLISHED:
