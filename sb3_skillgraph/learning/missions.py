@@ -18,13 +18,12 @@ EXPLORE = 0.9
 #: Proposals of which an exploration takes the one whose nearest event has been visited least: at least, and one for so many
 #: events, so that in a large graph, too, one of them lies where it ends, and not only behind some wall within it.
 LEAST_PROPOSALS, EVENTS_PER_PROPOSAL = 3, 20
-#: Events of a small graph, and of a large one. In a small one all is near: best is what teaches the walker most.
-FEW_EVENTS, MANY_EVENTS = 50, 100
-#: Share of the explorations that go on towards the proposed point, in a small graph and in a large one. The others walk at
-#: random, which finds what is near and teaches a walker much, but comes to nothing new in a large graph.
-LEAST_TOWARDS, MOST_TOWARDS = 0.5, 0.8
-#: Share of the explorations of a large graph that begin further away where nearer ones have found nothing; the others begin in
-#: the event nearest to the point. With all of them ways to travel were shorter, and what trains the walker is travelling.
+#: Share of the explorations that go on towards the proposed point, in a graph of so few events, and of so many or more. The
+#: others walk at random, which finds what is near and teaches a walker much, but comes to nothing new in a large graph.
+LEAST_TOWARDS, MOST_TOWARDS, FEW_EVENTS, MANY_EVENTS = 0.5, 0.8, 50, 100
+#: Share of the explorations that begin further away where nearer ones have found nothing: of a graph of twice MANY_EVENTS; in
+#: one of MANY_EVENTS, where all is near, none. The others begin in the event nearest to the point. With all of them ways to
+#: travel were shorter, and what trains the walker is travelling.
 FROM_FURTHER = 0.5
 #: Share of the missions that look for a way to a goal which adaptation is for, while nobody has been there, rather than go
 #: straight there; of those the share that sets out from the event nearest to it: often, but what lies nearest may be the far
@@ -235,21 +234,16 @@ class Missions(Agenda):
         may begin further away: for some they count as distance, by the root of their number.
         """
         distances = self.graph.distances(point)
-        if chance < FROM_FURTHER * self._largeness:
+        if chance < np.interp(len(distances), (MANY_EVENTS, 2 * MANY_EVENTS), (0.0, FROM_FURTHER)):
             distances = distances * np.sqrt(1.0 + self.graph.barren[: len(distances)])
         return int(distances.argmin())
 
     def _beyond(self, event: int, point: np.ndarray, chance: float) -> Mission:
         """Explore from an event, towards a point if chance wants it so, else at random."""
         goal, begins_in = self.graph.centers[event].copy(), self.graph.id(event)
-        if chance >= LEAST_TOWARDS + self._largeness * (MOST_TOWARDS - LEAST_TOWARDS):
+        if chance >= np.interp(len(self.graph.events), (FEW_EVENTS, MANY_EVENTS), (LEAST_TOWARDS, MOST_TOWARDS)):
             return Mission(goal, self.exploration_steps, None, begins_in)
         return Mission(goal, self.exploration_steps, self._past(goal, point), begins_in)
-
-    @property
-    def _largeness(self) -> float:
-        """From 0, of a small graph, to 1, of a large one."""
-        return float(np.interp(len(self.graph.events), (FEW_EVENTS, MANY_EVENTS), (0.0, 1.0)))
 
     def _past(self, begin: np.ndarray, point: np.ndarray) -> np.ndarray:
         """Return where an exploration that begins somewhere goes for a proposed point: as far past it as is wanted."""
