@@ -275,20 +275,20 @@ def soak() -> str:
     )
 
 
-def lone(row: Row) -> str:
-    """Return what is added to a number that a single seed has given."""
-    return " (one seed)" if row["seeds"] == 1 else ""
+def few(row: Row) -> str:
+    """Return what is added to a number that only one seed or two have given."""
+    return {1: " (one seed)", 2: " (two seeds)"}.get(row["seeds"], "")
 
 
 def beside(rows: dict[tuple[str, str], Row], environment: str, name: str) -> list[str]:
-    """Return what other methods came to, where they were run; a single seed is told.
+    """Return what other methods came to, where they were run; one seed or two are told.
 
     :param rows: by environment and method
     :param environment: which of them
     :param name: column
     """
     others = [rows.get((environment, method)) for method in ("straight-on", "ddpg-her")]
-    return ["" if row is None else f"{row[name]:.2f}{lone(row)}" for row in others]
+    return ["" if row is None else f"{row[name]:.2f}{few(row)}" for row in others]
 
 
 def readme_table() -> str:
@@ -307,7 +307,7 @@ def readme_table() -> str:
     official = {(row["environment"], row["method"]): row for row in [*summary("ogbench"), *summary("ogbench_ants")]}
     for environment in ("giant", "teleport", "ant-medium", "ant-large", "ant-teleport"):
         ours = official[environment, "skill-graph"]
-        success = f"{ours['task_success_rate']:.3f}{lone(ours)}"
+        success = f"{ours['task_success_rate']:.3f}{few(ours)}"
         if environment in PUBLISHED:
             success += f"; best published, offline: {PUBLISHED[environment]}"
         lines.append(
