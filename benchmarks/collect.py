@@ -31,6 +31,8 @@ RESULTS = pathlib.Path(__file__).parent / "results"
 Row = dict[str, Any]
 KEY = ("environment", "method", "seed")
 KEYS = {"runs": KEY, "curves": (*KEY, "steps"), "promises": (*KEY, "steps", "low")}
+#: Columns that are words even where they look like numbers, as a commit such as 72e3967 does (it would be infinite).
+WORDS = ("environment", "method", "version", "commit")
 #: Seeds from which on a bootstrap says something; with fewer a t interval is wider, and safer.
 ENOUGH_SEEDS = 5
 N_SAMPLES = 10_000  # of the bootstrap
@@ -117,7 +119,8 @@ def read(path: pathlib.Path) -> list[Row]:
     if not path.exists():
         return []
     with path.open(newline="") as file:
-        return [{name: _number(value) for name, value in row.items()} for row in csv.DictReader(file)]
+        rows = list(csv.DictReader(file))
+    return [{name: value if name in WORDS else _number(value) for name, value in row.items()} for row in rows]
 
 
 def _number(text: str) -> Any:

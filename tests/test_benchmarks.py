@@ -94,6 +94,14 @@ def test_collecting_again_changes_nothing_and_keeps_what_is_gone(finished: tuple
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir() if path.is_file()} == before
 
 
+@pytest.mark.parametrize("commit", ["72e3967", "0123456", "1234567", "nan"])
+def test_a_commit_that_looks_like_a_number_stays_one(commit: str, tmp_path: Path) -> None:
+    collect = module("collect")
+    rows = [{"environment": "toy", "method": "dsg", "seed": 3, "success_rate": 0.5, "version": "0.2", "commit": commit}]
+    collect.write(tmp_path / "runs.csv", rows)
+    assert collect.read(tmp_path / "runs.csv") == rows
+
+
 def test_intervals_are_paired_by_seeds() -> None:
     collect = module("collect")
     rates = {"a": [0.9, 0.5, 0.7, 0.8, 0.6], "b": [0.8, 0.4, 0.6, 0.7, 0.5]}
