@@ -8,12 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from sb3_skillgraph.metric_parts import Angle, Exact, Part, Rotation, Within, norm, positive_radius
+from sb3_skillgraph.metric_parts import Angle, Direction, Exact, Part, Rotation, Within, norm, positive_radius
 
 __all__ = [
     "Angle",
     "Ball",
     "Custom",
+    "Direction",
     "Exact",
     "Metric",
     "MetricFunction",
@@ -245,7 +246,7 @@ class Custom(Metric):
 
 #: A user's own distance, in radii.
 MetricFunction = Callable[[np.ndarray, np.ndarray], np.ndarray]
-_PARTS = {part.__name__: part for part in (Within, Angle, Rotation, Exact)}
+_PARTS = {part.__name__: part for part in (Within, Angle, Direction, Rotation, Exact)}
 
 
 def as_metric(given: Any) -> Metric:

@@ -82,6 +82,28 @@ class Angle(Within):
 
 
 @dataclass(frozen=True)
+class Direction(Within):
+    """A direction as a vector of length 1, such as a car's heading as its cosine and sine.
+
+    :param dims: the dimensions of the vector
+    :param radius: the angle, in radians, by which it may be off
+    """
+
+    def embed(self, points: np.ndarray) -> np.ndarray:
+        """Return points of a circle, or sphere, on which the radius is a chord of length 1."""
+        return _unit(points) / _chord(self.radius)
+
+    @property
+    def reach(self) -> float:
+        """How much a number of the vector changes by a turn of the radius."""
+        return math.sin(min(self.radius, 0.5 * math.pi))
+
+    def nearest_goal(self, point: np.ndarray) -> np.ndarray:
+        """Return the vector of length 1."""
+        return _unit(point)
+
+
+@dataclass(frozen=True)
 class Rotation(Within):
     """A rotation in space as a unit quaternion (w, x, y, z), the same as its negative.
 
@@ -96,8 +118,7 @@ class Rotation(Within):
 
     def embed(self, points: np.ndarray) -> np.ndarray:
         """Return rotation matrices, shape ``(..., 9)``: the distance between two follows from the angle between them."""
-        length = np.maximum(norm(points)[..., None], 1e-9)
-        w, x, y, z = np.moveaxis(points / length, -1, 0)
+        w, x, y, z = np.moveaxis(_unit(points), -1, 0)
         rows = [
             [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
             [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
@@ -113,7 +134,7 @@ class Rotation(Within):
 
     def nearest_goal(self, point: np.ndarray) -> np.ndarray:
         """Return the quaternion of length 1."""
-        return point / max(float(np.linalg.norm(point)), 1e-9)
+        return _unit(point)
 
 
 @dataclass(frozen=True)
@@ -150,6 +171,11 @@ def positive_radius(radius: Any) -> float:
 def norm(vectors: np.ndarray) -> np.ndarray:
     """Return the Euclidean norms of vectors, shape ``(..., n)``."""
     return np.sqrt(np.einsum("...i,...i->...", vectors, vectors))
+
+
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    """Return vectors, shape ``(..., n)``, made as long as 1."""
+    return vectors / np.maximum(norm(vectors)[..., None], 1e-9)
 
 
 def _chord(angle: float) -> float:

@@ -13,11 +13,24 @@ from hypothesis import strategies as st
 
 from sb3_skillgraph import SkillGraphAgent
 from sb3_skillgraph.goal_env import env_metric
-from sb3_skillgraph.metric import MISMATCH, Angle, Ball, Custom, Exact, Metric, Product, Rotation, Within, as_metric
+from sb3_skillgraph.metric import (
+    MISMATCH,
+    Angle,
+    Ball,
+    Custom,
+    Direction,
+    Exact,
+    Metric,
+    Product,
+    Rotation,
+    Within,
+    as_metric,
+)
 
 TOY = "SkillGraph/ToyMaze-v0"
 MIXED = Product(Within((0, 1), 0.5), Angle((2,), 0.3), Exact((3,)))
-METRICS = [Ball(0.45), as_metric([0.5, 2.0, np.inf, 0.1]), MIXED, Product(Rotation((0, 1, 2, 3), 0.2))]
+HEADING = Product(Within((0, 1), 0.5), Direction((2, 3), 0.3))
+METRICS = [Ball(0.45), as_metric([0.5, 2.0, np.inf, 0.1]), MIXED, HEADING, Product(Rotation((0, 1, 2, 3), 0.2))]
 
 
 def numbers(n: int) -> Any:
@@ -54,6 +67,19 @@ def test_an_angle_is_reached_within_its_radius_whatever_the_turns(angle: float, 
     reached = metric.reached(np.array([angle + off + 2.0 * math.pi * turns]), np.array([angle]))
     if abs(abs(off) - 0.3) > 1e-6:
         assert reached == (abs(off) < 0.3)
+
+
+@profile(60)
+@given(angle=st.floats(-10.0, 10.0), off=st.floats(-math.pi, math.pi), length=st.floats(0.1, 10.0))
+def test_a_direction_is_reached_within_its_angle_whatever_its_length(angle: float, off: float, length: float) -> None:
+    def heading(angle: float) -> np.ndarray:
+        return np.array([1.0, 2.0, math.cos(angle), math.sin(angle)])
+
+    aside = heading(angle + off) * [1.0, 1.0, length, length]
+    if abs(abs(off) - 0.3) > 1e-6:
+        assert HEADING.reached(aside, heading(angle)) == (abs(off) < 0.3)
+    np.testing.assert_allclose(HEADING.nearest_goal(aside), heading(angle + off), atol=1e-9)
+    assert as_metric(HEADING.get_state()).reached(aside, heading(angle + off))
 
 
 @profile(60)

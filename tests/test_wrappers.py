@@ -7,11 +7,13 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from conftest import TOY
+from gymnasium import spaces
 from gymnasium.wrappers import TransformAction
 
 import sb3_skillgraph.envs.mujoco_mazes  # noqa: F401 (imports gymnasium-robotics, which registers its ants)
 from sb3_skillgraph import SkillGraphAgent, evaluate_pairs
-from sb3_skillgraph.envs import AntRecipe, FlattenGoals, HoldAction, PursueGoals, TellStuck, on_its_back
+from sb3_skillgraph.envs import AntRecipe, FlattenGoals, HoldAction, Parking, PursueGoals, TellStuck, on_its_back
+from sb3_skillgraph.goal_env import metric_of
 from sb3_skillgraph.hyperparams import load_hyperparams, make_recommended, recommended_wrapper
 from sb3_skillgraph.metric import Ball
 
@@ -190,6 +192,47 @@ def test_the_kitchen_has_flat_goals_by_name() -> None:
     reached[0] += 0.31
     assert not env.goal_metric.reached(reached, observation["desired_goal"])
     gym.make(env.spec).close()
+
+
+class Car(gym.Env):
+    """highway-env's parking-v0, as far as it can be told from outside: it crashes at its second step."""
+
+    def __init__(self) -> None:
+        space = spaces.Box(-np.inf, np.inf, (6,), np.float64)
+        self.observation_space = spaces.Dict(observation=space, achieved_goal=space, desired_goal=space)
+        self.action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
+
+    def _seen(self) -> dict[str, np.ndarray]:
+        return dict.fromkeys(("observation", "achieved_goal", "desired_goal"), np.array([0.1, 0.1, 0.0, 0.0, 0.0, 1.0]))
+
+    def reset(self, **kwargs: Any) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        super().reset(seed=kwargs.get("seed"))
+        self.n_steps = 0
+        return self._seen(), {}
+
+    def step(self, action: np.ndarray) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
+        self.n_steps += 1
+        crashed = self.n_steps == 2
+        return self._seen(), 0.0, crashed, False, {"crashed": crashed, "is_success": np.False_}
+
+
+def test_a_crashed_car_is_stuck() -> None:
+    env = Parking(Car())
+    env.reset(seed=0)
+    assert env.step(np.zeros(2, dtype=np.float32))[4]["stuck"] is False
+    assert env.step(np.zeros(2, dtype=np.float32))[4]["stuck"] is True
+
+
+def test_a_car_that_counts_as_parked_is_so_by_its_environments_rule() -> None:
+    rng = np.random.default_rng(0)
+    metric, goal = metric_of(Parking(Car())), np.array([0.1, 0.14, 0.0, 0.0, 0.0, 1.0])
+    assert metric is not None
+    turns = rng.uniform(-0.4, 0.4, 2_000)
+    cars = goal + np.stack([*rng.uniform(-0.02, 0.02, (4, 2_000)), np.sin(turns), np.cos(turns) - 1.0], axis=1)
+    parked = np.abs(cars - goal) @ np.array([1.0, 0.3, 0.0, 0.0, 0.02, 0.02]) < 0.12**2  # highway-env's, by default
+    counts = metric.distance(cars, goal) <= metric.radius
+    assert counts.sum() > 50 and parked[counts].mean() > 0.95
+    assert not metric.reached(goal * [1.0, 1.0, 0.0, 0.0, 1.0, -1.0], goal), "it stands the other way round"
 
 
 def test_only_nested_goals_are_flattened() -> None:

@@ -8,7 +8,7 @@ import gymnasium as gym
 from sb3_skillgraph.envs.maze_geometry import LARGE_MAZE, MEDIUM_MAZE, OPEN_AREA, U_MAZE, MazeGeometry, MazeMap
 from sb3_skillgraph.envs.task import GoalTask
 from sb3_skillgraph.envs.toy import ToyMazeEnv
-from sb3_skillgraph.envs.wrappers import AntRecipe, FlattenGoals, HoldAction, PursueGoals, TellStuck, on_its_back
+from sb3_skillgraph.envs.wrappers import AntRecipe, FlattenGoals, HoldAction, Parking, PursueGoals, TellStuck, on_its_back
 
 __all__ = [
     "LARGE_MAZE",
@@ -21,6 +21,7 @@ __all__ = [
     "HoldAction",
     "MazeGeometry",
     "MazeMap",
+    "Parking",
     "PursueGoals",
     "TellStuck",
     "ToyMazeEnv",

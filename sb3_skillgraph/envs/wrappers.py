@@ -7,7 +7,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from sb3_skillgraph.metric import Product, Within, as_metric
+from sb3_skillgraph.metric import Direction, Product, Within, as_metric
 
 _UPRIGHT = 0.2  # upward component of the torso's axis below which it lies on its side or back
 
@@ -178,6 +178,31 @@ def flat_kitchen(env: gym.Env) -> FlattenGoals:
     from gymnasium_robotics.envs.franka_kitchen.kitchen_env import BONUS_THRESH
 
     return FlattenGoals(env, BONUS_THRESH)
+
+
+class Parking(gym.Wrapper, gym.utils.RecordConstructorArgs):
+    """
+    highway-env's ``parking-v0``, telling when a car is parked, and that one which has crashed is stuck.
+
+    Its own rule is a weighted sum of how far off x, y and the heading (as cosine and sine) are. All but the corners of what is
+    near enough to count here does there, too.
+
+    :param env: ``parking-v0`` with its own weights
+    """
+
+    goal_metric = Product(Within([0], 0.005), Within([1], 0.015), Direction([4, 5], 0.25))
+
+    def __init__(self, env: gym.Env) -> None:
+        gym.utils.RecordConstructorArgs.__init__(self)
+        gym.Wrapper.__init__(self, env)
+
+    def step(self, action: np.ndarray) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """Take a step.
+
+        :param action: action of the wrapped environment
+        """
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        return observation, reward, terminated, truncated, {**info, "stuck": bool(info["crashed"])}
 
 
 class PursueGoals(gym.Wrapper, gym.utils.RecordConstructorArgs):
