@@ -1,8 +1,7 @@
 """An environment of one's own, made fit by wrappers."""
 
 from collections.abc import Iterator
-from types import SimpleNamespace
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -198,11 +197,7 @@ def test_the_kitchen_has_flat_goals_by_name() -> None:
 class Car(gym.Env):
     """highway-env's parking-v0, as far as it can be told from outside: it crashes at its second step."""
 
-    config: ClassVar[dict[str, Any]] = {"observation": {"scales": [100, 100, 5, 5, 1, 1]}}
-
     def __init__(self) -> None:
-        lane = SimpleNamespace(length=8.0, heading=np.pi / 2, position=lambda along, aside: np.array([10.0, 10.0 + along]))
-        self.road = SimpleNamespace(network=SimpleNamespace(lanes_dict=lambda: {("a", "b", 0): lane}))
         space = spaces.Box(-np.inf, np.inf, (6,), np.float64)
         self.observation_space = spaces.Dict(observation=space, achieved_goal=space, desired_goal=space)
         self.action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
@@ -226,13 +221,6 @@ def test_a_crashed_car_is_stuck() -> None:
     env.reset(seed=0)
     assert env.step(np.zeros(2, dtype=np.float32))[4]["stuck"] is False
     assert env.step(np.zeros(2, dtype=np.float32))[4]["stuck"] is True
-
-
-def test_a_parking_spot_is_a_goal() -> None:
-    env = Parking(Car())
-    spot = env.sample_free(np.random.default_rng(0))
-    np.testing.assert_allclose(spot, [0.1, 0.14, 0.0, 0.0, 0.0, 1.0], atol=1e-9)
-    assert env.observation_space["desired_goal"].contains(spot)
 
 
 def test_a_car_that_counts_as_parked_is_so_by_its_environments_rule() -> None:

@@ -182,7 +182,7 @@ def flat_kitchen(env: gym.Env) -> FlattenGoals:
 
 class Parking(gym.Wrapper, gym.utils.RecordConstructorArgs):
     """
-    highway-env's ``parking-v0``, telling where there are spots, when a car is parked, and that one which has crashed is stuck.
+    highway-env's ``parking-v0``, telling when a car is parked, and that one which has crashed is stuck.
 
     Its own rule is a weighted sum of how far off x, y and the heading (as cosine and sine) are. All but the corners of what is
     near enough to count here does there, too.
@@ -203,18 +203,6 @@ class Parking(gym.Wrapper, gym.utils.RecordConstructorArgs):
         """
         observation, reward, terminated, truncated, info = self.env.step(action)
         return observation, reward, terminated, truncated, {**info, "stuck": bool(info["crashed"])}
-
-    def sample_free(self, rng: np.random.Generator) -> np.ndarray:
-        """Draw a parking spot, shape ``(6,)``: the goal of a car in it.
-
-        :param rng: random generator
-        """
-        task: Any = self.unwrapped
-        spots = list(task.road.network.lanes_dict().values())
-        spot = spots[rng.integers(len(spots))]
-        scales = task.config["observation"]["scales"]
-        place = [*spot.position(spot.length / 2, 0), 0.0, 0.0, np.cos(spot.heading), np.sin(spot.heading)]
-        return np.array(place) / scales
 
 
 class PursueGoals(gym.Wrapper, gym.utils.RecordConstructorArgs):
