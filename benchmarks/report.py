@@ -30,6 +30,7 @@ TASKS = {
     "panda-reach": "`PandaReach-v3`",
     "point-large": "`PointMaze_Large-v3`",
     "fetch-push": "`FetchPush-v4`",
+    "parking": "`parking-v0` of highway-env",
     "ant-umaze-v5": "`AntMaze_UMaze-v5`, recipe's wrappers",
     "ant-umaze": "Ant, U-maze",
     "ant-reacher": "Ant, open floor",
