@@ -223,20 +223,21 @@ class Missions(Agenda):
             return self._random_walk(point)
         # Of several, the one that lies where the agent has been least: there is most to find
         chance = float(self.rng.random())
-        departures = [self._departure(proposal, chance) for proposal in points]
+        departures = self._departures(points, chance)
         rarest = int(np.argmin(self.graph.visits[departures]))
         return self._beyond(departures[rarest], points[rarest], chance)
 
-    def _departure(self, point: np.ndarray, chance: float) -> int:
-        """Return the event to explore towards a point from.
+    def _departures(self, points: list[np.ndarray], chance: float) -> list[int]:
+        """Return the event to explore from, towards each of some points.
 
         It is the nearest one; but where explorations have kept finding nothing a wall may stand between the two, and the way
         may begin further away: for some they count as distance, by the root of their number.
         """
-        distances = self.graph.distances(point)
-        if chance < np.interp(len(distances), (MANY_EVENTS, 2 * MANY_EVENTS), (0.0, FROM_FURTHER)):
-            distances = distances * np.sqrt(1.0 + self.graph.barren[: len(distances)])
-        return int(distances.argmin())
+        n_events = len(self.graph.events)
+        weight = np.ones(n_events)
+        if chance < np.interp(n_events, (MANY_EVENTS, 2 * MANY_EVENTS), (0.0, FROM_FURTHER)):
+            weight = np.sqrt(1.0 + self.graph.barren[:n_events])
+        return [int((weight * self.graph.distances(point)).argmin()) for point in points]
 
     def _beyond(self, event: int, point: np.ndarray, chance: float) -> Mission:
         """Explore from an event, towards a point if chance wants it so, else at random."""
@@ -265,4 +266,4 @@ class Missions(Agenda):
             points = self.rng.uniform(*box, (N_DRAWN, self.graph.goal_dim))
             place = next((point for point in points if self.graph.locate(point) == NOWHERE), goal)
         chance = float(self.rng.random())
-        return self._beyond(self._departure(place, chance), place, chance)
+        return self._beyond(self._departures([place], chance)[0], place, chance)
