@@ -123,13 +123,11 @@ def read(path: pathlib.Path) -> list[Row]:
     return [{name: value if name in WORDS else _number(value) for name, value in row.items()} for row in rows]
 
 
-def _number(text: str) -> Any:
-    for kind in (int, float):
-        try:
-            return kind(text)
-        except ValueError:
-            pass
-    return text
+def _number(text: str) -> int | float:
+    try:
+        return int(text)
+    except ValueError:
+        return float(text)
 
 
 def write(path: pathlib.Path, rows: list[Row]) -> None:

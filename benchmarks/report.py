@@ -66,10 +66,15 @@ def number(value: float, digits: int = 2) -> str:
     return "-" if math.isnan(value) else f"{value:.{digits}f}"
 
 
+def few(row: Row) -> str:
+    """Return what is added to a number that only one seed or two have given."""
+    return {1: " (one seed)", 2: " (two seeds)"}.get(row["seeds"], "")
+
+
 def rate(row: Row) -> str:
     """Return a mean over seeds with its interval."""
     if math.isnan(row["low"]):
-        return f"{row['mean']:.2f} (one seed)"
+        return f"{row['mean']:.2f}{few(row)}"
     return f"{row['mean']:.3f} ({row['low']:.2f} to {row['high']:.2f})"
 
 
@@ -274,11 +279,6 @@ def soak() -> str:
         f"the last tenth goes at {result['last_over_second']:.2f} of the pace of the second, and the process holds "
         f"{result['memory_since_full']:.3f} times the memory that it held when its replay buffer became full"
     )
-
-
-def few(row: Row) -> str:
-    """Return what is added to a number that only one seed or two have given."""
-    return {1: " (one seed)", 2: " (two seeds)"}.get(row["seeds"], "")
 
 
 def beside(rows: dict[tuple[str, str], Row], environment: str, name: str) -> list[str]:
