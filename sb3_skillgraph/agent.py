@@ -19,6 +19,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 from stable_baselines3.td3.policies import MultiInputPolicy
 
 from sb3_skillgraph import persistence
+from sb3_skillgraph.arguments import check_arguments
 from sb3_skillgraph.events import Event
 from sb3_skillgraph.goal_env import GoalSpec, as_batch, as_goal, check_finite, refuse_changed_goals, rows, with_terminal
 from sb3_skillgraph.interrupts import Interrupts
@@ -139,6 +140,7 @@ class SkillGraphAgent(OffPolicyAlgorithm):
         self._arguments = {k: v for k, v in locals().items() if k not in ("self", "env", "_init_setup_model", "__class__")}
         if isinstance(policy, str) and policy not in self.policy_aliases:
             raise ValueError(f"Unknown policy {policy!r}: goal environments have Dict observations, use 'MultiInputPolicy'.")
+        check_arguments(self._arguments)
         refuse_changed_goals(env)
         if env is not None and not isinstance(env, str):
             GoalSpec.of(env.observation_space, env.action_space)  # before SB3 asserts less clearly

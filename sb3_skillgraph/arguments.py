@@ -6,9 +6,11 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 from stable_baselines3 import DDPG, SAC, TD3
+from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_skillgraph.envs.wrappers import TIME_LIMITS
 from sb3_skillgraph.goal_env import Oracle, env_attribute, env_metric
 from sb3_skillgraph.graph import SkillGraph
 from sb3_skillgraph.learning.dco import LEARN_EVERY, DCOSalience
@@ -71,7 +73,7 @@ def check_arguments(arguments: dict[str, Any]) -> None:
     :raises ValueError: naming the argument and what it may be
     """
     noise, train_freq = arguments["action_noise"], arguments["train_freq"]
-    given = {**arguments, "action_noise": noise if isinstance(noise, int | float | str) else 0.0}
+    given = {**arguments, "action_noise": 0.0 if noise is None or isinstance(noise, ActionNoise) else noise}
     for ranges, kinds, what in ((_RANGES, (int, float, np.number), "a number"), (_WHOLE, (int, np.integer), "a whole number")):
         for name, (low, high) in ranges.items():
             value = given[name]
@@ -79,11 +81,16 @@ def check_arguments(arguments: dict[str, Any]) -> None:
                 upper = f"to {high:g}" if high < 1e6 else "on"
                 raise ValueError(f"{name} must be {what} from {low:g} {upper}, not {value!r}.")
     rate = arguments["learning_rate"]
-    if not callable(rate) and not (isinstance(rate, int | float) and 0 <= rate <= FASTEST):
+    is_rate = isinstance(rate, int | float | np.number) and not isinstance(rate, bool) and 0 <= rate <= FASTEST
+    if not callable(rate) and not is_rate:
         raise ValueError(f"learning_rate must be a number from 0 to {FASTEST}, or a schedule, not {rate!r}.")
     frequency = train_freq[0] if isinstance(train_freq, tuple) else train_freq
-    if isinstance(frequency, int) and not 1 <= frequency <= LONGEST_ROLLOUT:
+    if isinstance(frequency, int) and (isinstance(frequency, bool) or not 1 <= frequency <= LONGEST_ROLLOUT):
         raise ValueError(f"train_freq must be from 1 to {LONGEST_ROLLOUT}, not {train_freq!r}.")
+    for name in ("seed", "verbose"):
+        value = arguments[name]
+        if value is not None and (isinstance(value, bool) or not isinstance(value, int | np.integer)):
+            raise ValueError(f"{name} must be a whole number, not {value!r}.")
     if arguments["skills"] not in SKILLS:
         raise ValueError(f"skills must be one of {', '.join(map(repr, SKILLS))}, not {arguments['skills']!r}.")
 
@@ -122,12 +129,8 @@ def horizon(env: VecEnv | None) -> int:
 
     :param env: the environment
     """
-    if env is not None:
-        for name in ("max_steps", "_max_episode_steps"):
-            limit = env_attribute(env, name)
-            if limit:
-                return int(limit)
-    return HORIZON
+    limits = [] if env is None else [env_attribute(env, name) for name in TIME_LIMITS]
+    return min((int(limit) for limit in limits if limit), default=HORIZON)
 
 
 def option_kwargs(agent: OffPolicyAlgorithm, arguments: dict[str, Any]) -> dict[str, Any]:

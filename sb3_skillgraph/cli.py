@@ -174,9 +174,9 @@ def _train(args: argparse.Namespace) -> int:
         hyperparams = {**recommended, **given}
     n_timesteps = int(hyperparams.pop("n_timesteps"))
     env_kwargs, steps = dict(args.env_kwargs), args.steps or n_timesteps
-    given_log = hyperparams.pop("tensorboard_log", None)
-    tensorboard = args.tensorboard or given_log is not None
-    train(args.env, env_kwargs, hyperparams, steps, args.seed, out, args.n_envs, args.device, args.verbose, tensorboard)
+    if hyperparams.pop("tensorboard_log", None) is not None:
+        raise UserError("tensorboard_log is not for --hyperparams: --tensorboard writes the log into OUT.")
+    train(args.env, env_kwargs, hyperparams, steps, args.seed, out, args.n_envs, args.device, args.verbose, args.tensorboard)
     return 0
 
 

@@ -9,8 +9,9 @@ import numpy as np
 from tqdm import tqdm
 
 from sb3_skillgraph.agent import SkillGraphAgent
-from sb3_skillgraph.envs import MazeGeometry
+from sb3_skillgraph.envs import MazeGeometry, find
 from sb3_skillgraph.goal_env import metric_of
+from sb3_skillgraph.hyperparams import make_recommended
 from sb3_skillgraph.planning import DIRECT
 
 
@@ -206,11 +207,12 @@ def evaluate_pairs(
 
     The agent is the same for every pair: acting changes nothing in it, and adaptation works on a copy. For each pair
     the environment is reset to its start; the pair succeeds if the goal is reached at any step of the episode (1000 steps on
-    ``SkillGraph/*`` mazes). Other environments draw start and goal themselves, at each reset; reached is what they call so in
+    ``SkillGraph/*`` mazes). Other environments, and ``SkillGraph/PointKeyDoor-v0``, draw start and goal themselves, at each
+    reset; reached is what they call so in
     ``info["is_success"]`` or ``info["success"]``, else to be within their radius, or the agent's ``event_radius``.
 
     :param agent: anything with SB3's ``predict``
-    :param env: a goal environment, or the id of one
+    :param env: a goal environment, or the id of one, which gets the wrapper that is recommended for it
     :param env_kwargs: keyword arguments for an id, such as ``maze_map`` or ``success_radius``
     :param n_pairs: number of pairs
     :param seed: seed of the pairs, and of the environment
@@ -218,7 +220,7 @@ def evaluate_pairs(
     :param progress_bar: whether to show how far it is
     :return: success rate, interval and every pair
     :raises ValueError: if it is no goal environment, or does not tell when a goal is reached
-    :raises NoPairsError: if it is a maze that is too small
+    :raises NoPairsError: if it is a maze that is too small, or adaptation is asked for where start and goal cannot be given
 
     >>> from sb3_skillgraph.baselines import RandomWalk
     >>> env = gym.make("SkillGraph/ToyMaze-v0", max_steps=50)
@@ -228,20 +230,22 @@ def evaluate_pairs(
     """
     if n_pairs < 1:
         raise ValueError(f"n_pairs must be 1 at least, not {n_pairs!r}.")
-    made = gym.make(env, **(env_kwargs or {})) if isinstance(env, str) else env
+    if isinstance(env, str):
+        find(env)
+    made = make_recommended(env, env_kwargs or {}) if isinstance(env, str) else env
     try:
         drawn: Sequence[tuple[np.ndarray | None, np.ndarray | None, float]] = [(None, None, np.nan)] * n_pairs
         if made.has_wrapper_attr("geometry") and not made.has_wrapper_attr("goal_metric"):
             drawn = sample_pairs(made.get_wrapper_attr("geometry"), made.get_wrapper_attr("body_radius"), n_pairs, seed)
+        elif adapt_timesteps:
+            raise NoPairsError("To adapt, the environment must take start and goal at reset, as SkillGraph/* do.")
         made.reset(seed=seed)
         results = []
         for start, goal, cells in tqdm(drawn, unit="pair", disable=not progress_bar):
             tested: Any = agent
             if adapt_timesteps:
-                assert made.spec is not None, "To adapt, give the environment's id."
+                assert made.spec is not None, "To adapt, give the environment's id, or make it by gym.make."
                 tested = tested.copy(gym.make(made.spec))
-                if goal is None:
-                    raise ValueError("To adapt, the environment must take start and goal at reset, as SkillGraph/* do.")
                 tested.adapt(goal, start=start, total_timesteps=adapt_timesteps)
             results.append(run_pair(tested, made, start, goal, cells))
             if tested is not agent:

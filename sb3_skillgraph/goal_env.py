@@ -9,7 +9,7 @@ from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, is_vecenv_wrapped, unwrap_vec_normalize
 
 from sb3_skillgraph.checking import HUGE
-from sb3_skillgraph.metric import Metric, Product, Rotation, Within, as_metric
+from sb3_skillgraph.metric import Metric, Product, Rotation, Tilt, Within, as_metric
 from sb3_skillgraph.options.views import BODY_NUMBERS, View, as_view, body_view, egocentric_view, placed_body_view
 
 KEYS = ("observation", "achieved_goal", "desired_goal")
@@ -184,15 +184,13 @@ def env_metric(get: Callable[[str], Any], goal_dim: int) -> Metric | None:
     :param goal_dim: length of a goal
     :raises ValueError: if what it tells is no metric
     """
-    told = [
-        get("goal_metric"),
-        get("success_radius"),
-        get("distance_threshold"),
-        getattr(get("task"), "distance_threshold", None),  # panda-gym
-        # gymnasium-robotics' mazes have a number in their code, and no name for it.
-        ROBOTICS_MAZE_RADIUS if hasattr(get("maze"), "maze_size_scaling") else None,
-    ]
-    radius = next((value for value in told if value is not None), None)
+    names = ("goal_metric", "success_radius", "distance_threshold")
+    radius = next((value for value in map(get, names) if value is not None), None)
+    if radius is None:
+        # These are asked last: a task, or a maze, may be something that cannot leave its process
+        radius = getattr(get("task"), "distance_threshold", None)  # panda-gym
+    if radius is None and hasattr(get("maze"), "maze_size_scaling"):
+        radius = ROBOTICS_MAZE_RADIUS  # gymnasium-robotics' mazes have a number in their code, and no name for it
     turn = get("rotation_threshold")
     if turn is not None and goal_dim == POSE_DIM and radius is not None:
         return _pose_metric(get, radius, turn)
@@ -213,7 +211,8 @@ def metric_of(env: gym.Env) -> Metric | None:
 
 def _pose_metric(get: Callable[[str], Any], radius: float, turn: float) -> Metric:
     """Return the metric of poses (x, y, z, quaternion) as gymnasium-robotics' hands have them."""
-    place, rotation = Within(range(3), radius), Rotation(range(3, POSE_DIM), turn)
+    kind = Tilt if get("ignore_z_target_rotation") else Rotation
+    place, rotation = Within(range(3), radius), kind(range(3, POSE_DIM), turn)
     if get("target_position") == "ignore":
         return Product(rotation)
     if get("target_rotation") == "ignore":

@@ -6,7 +6,7 @@ import numpy as np
 
 from sb3_skillgraph.edges import NOWHERE, RECORD, Edges, land
 from sb3_skillgraph.events import Event
-from sb3_skillgraph.metric import Metric, as_metric
+from sb3_skillgraph.metric import MISMATCH, Metric, as_metric
 
 if TYPE_CHECKING:
     import networkx
@@ -124,7 +124,13 @@ class SkillGraph:
         """Merge events that lie close together, salient ones last; their records become one.
 
         :return: the new index of every old event
+        :raises ValueError: if only what has to match tells events apart
         """
+        if self.cover_radius * GROWTH >= MISMATCH and self.metric.n_matched:
+            raise ValueError(
+                f"What has to match (Exact) takes more values than max_events={self.max_events} events can stand for: more "
+                "events are needed, or what takes so many values must be measured (Within)."
+            )
         self.cover_radius *= GROWTH
         # Salient events first, then old ones: each stays unless one that stays lies too near
         order = sorted(range(len(self.events)), key=lambda i: (not self.events[i].salient, i))

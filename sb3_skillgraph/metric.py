@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from sb3_skillgraph.metric_parts import Angle, Direction, Exact, Part, Rotation, Within, norm, positive_radius
+from sb3_skillgraph.metric_parts import Angle, Direction, Exact, Part, Rotation, Tilt, Within, norm, positive_radius
 
 __all__ = [
     "Angle",
@@ -21,11 +21,14 @@ __all__ = [
     "Part",
     "Product",
     "Rotation",
+    "Tilt",
     "Within",
     "as_metric",
+    "as_saved",
 ]
 
-#: Radii by which goals are apart, beside all else, for every dimension that has to match and does not: no event is so large.
+#: Radii by which goals are apart, beside all else, for every dimension that has to match and does not: no event may be so
+#: large.
 MISMATCH = 1_000.0
 #: Values of a dimension that has to match are the same up to this difference: whole numbers are told apart.
 SAME = 0.5
@@ -145,12 +148,15 @@ class Product(Metric):
         if not any(isinstance(part, Within) for part in parts) or len(set(dims)) < len(dims) or min(dims) < 0:
             raise ValueError(f"event_radius needs parts with a radius, and each dimension at most once, not {list(parts)}.")
         self.parts = parts
+        self.length: int | None = None  # of goals, where a radius was given for each dimension
         self._measured = [part for part in parts if isinstance(part, Within)]
         self._matched = [i for part in parts if isinstance(part, Exact) for i in part.dims]
         self.n_matched = len(self._matched)
 
     def check(self, goal_dim: int) -> None:
-        """Refuse goals that have not all of the dimensions."""
+        """Refuse goals that have not all of the dimensions, or others than there are radii for."""
+        if self.length not in (None, goal_dim):
+            raise ValueError(f"event_radius has {self.length} radii for goals that have {goal_dim} dimensions.")
         last = max(i for part in self.parts for i in part.dims)
         if last >= goal_dim:
             raise ValueError(f"event_radius speaks of dimension {last} (counted from 0) of goals that have {goal_dim}.")
@@ -239,6 +245,16 @@ class Custom(Metric):
             self._known_units[goal_dim] = np.where((away == 0.0).all(axis=0), np.inf, units)
         return self._known_units[goal_dim]
 
+    def check(self, goal_dim: int) -> None:
+        """Refuse a function that does not take many points at once."""
+        points = np.zeros((3, 2, goal_dim))
+        shape = np.shape(self.function(points, points[0]))
+        if shape != (3, 2):
+            raise ValueError(
+                f"event_radius={self!r} must return a distance for each of many points, shape (...) for points of shape "
+                f"(..., goal_dim); of shape (3, 2, {goal_dim}) it returned shape {shape}. With np.linalg.norm, give axis=-1."
+            )
+
     def get_state(self) -> Any:
         """Return the function."""
         return self.function
@@ -246,7 +262,7 @@ class Custom(Metric):
 
 #: A user's own distance, in radii.
 MetricFunction = Callable[[np.ndarray, np.ndarray], np.ndarray]
-_PARTS = {part.__name__: part for part in (Within, Angle, Direction, Rotation, Exact)}
+_PARTS = {part.__name__: part for part in (Within, Angle, Direction, Rotation, Tilt, Exact)}
 
 
 def as_metric(given: Any) -> Metric:
@@ -269,9 +285,26 @@ def as_metric(given: Any) -> Metric:
     if isinstance(given, dict) and given.get("parts"):
         return Product(*(_part(**spec) for spec in given["parts"]))
     if isinstance(given, list | tuple | np.ndarray) and np.ndim(given) == 1:
-        return Product(*(Within((i,), radius) for i, radius in enumerate(given) if radius != np.inf))
+        product = Product(*(Within((i,), radius) for i, radius in enumerate(given) if radius != np.inf))
+        product.length = len(given)
+        return product
     return Ball(given)
 
 
-def _part(kind: str, **arguments: Any) -> Part:
-    return _PARTS[kind](**arguments)
+def _part(kind: Any = None, **arguments: Any) -> Part:
+    if kind not in _PARTS:
+        raise ValueError(f"event_radius: a part is of kind {', '.join(_PARTS)}, not {kind!r}.")
+    try:
+        return _PARTS[kind](**arguments)
+    except TypeError as error:
+        raise ValueError(f"event_radius: {kind} cannot be made of {arguments}: {error}.") from error
+
+
+def as_saved(metric: Metric) -> Any:
+    """Return what a file can keep of a metric: what :func:`as_metric` makes it of, or itself, of which only the name is kept.
+
+    :param metric: of one of these classes, or of a user's own
+    """
+    parts = metric.parts if isinstance(metric, Product) else ()
+    ours = type(metric) in (Ball, Product, Custom) and all(type(part) in _PARTS.values() for part in parts)
+    return metric.get_state() if ours else metric

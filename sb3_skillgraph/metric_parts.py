@@ -69,7 +69,7 @@ class Angle(Within):
     """Angles, each the same after a whole turn.
 
     :param dims: which dimensions
-    :param radius: within which each has to be, in radians
+    :param radius: within which they have to be, together, in radians
     """
 
     def embed(self, points: np.ndarray) -> np.ndarray:
@@ -135,6 +135,24 @@ class Rotation(Within):
     def nearest_goal(self, point: np.ndarray) -> np.ndarray:
         """Return the quaternion of length 1."""
         return _unit(point)
+
+
+@dataclass(frozen=True)
+class Tilt(Rotation):
+    """A rotation in space, whatever its turn about the body's own z axis: how a pen points.
+
+    :param dims: the four dimensions of a quaternion (w, x, y, z)
+    :param radius: the angle, in radians, by which it may be off when both are turned back
+    """
+
+    def embed(self, points: np.ndarray) -> np.ndarray:
+        """Return rotation matrices, shape ``(..., 9)``, of the rotations about x and then y that are left."""
+        w, x, y, z = np.moveaxis(_unit(points), -1, 0)
+        # Where the z axis points tells both angles
+        about_x = np.arctan2(2.0 * (w * x - y * z), 1.0 - 2.0 * (x * x + y * y)) / 2.0
+        about_y = np.arcsin(np.clip(2.0 * (x * z + w * y), -1.0, 1.0)) / 2.0
+        cos_x, sin_x, cos_y, sin_y = np.cos(about_x), np.sin(about_x), np.cos(about_y), np.sin(about_y)
+        return super().embed(np.stack([cos_x * cos_y, sin_x * cos_y, cos_x * sin_y, sin_x * sin_y], axis=-1))
 
 
 @dataclass(frozen=True)

@@ -4,9 +4,10 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
+from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_skillgraph.arguments import box, check_arguments, find_salience, goal_metric, horizon, option_class, option_kwargs
+from sb3_skillgraph.arguments import box, find_salience, goal_metric, horizon, option_class, option_kwargs
 from sb3_skillgraph.goal_env import GoalSpec, find_view
 from sb3_skillgraph.graph import SkillGraph
 from sb3_skillgraph.learning.growth import Growth, Skills
@@ -55,14 +56,13 @@ class Common(NamedTuple):
     def build(
         cls, agent: OffPolicyAlgorithm, spec: GoalSpec, arguments: dict[str, Any], replay: dict[str, Any] | None = None
     ) -> "Common":
-        """Check the arguments, and build what follows from them directly.
+        """Build what follows from the arguments directly.
 
         :param agent: gives environment, spaces, SB3's arguments and device
         :param spec: lengths of observation, goal and action
         :param arguments: the agent's keyword arguments
         :param replay: further arguments of the options' replay buffers
         """
-        check_arguments(arguments)
         rng = np.random.default_rng(agent.seed)
         metric = goal_metric(arguments["event_radius"], agent.env, spec.goal_dim)
         view_name, function = find_view(arguments["option_view"], agent.env, spec, metric)
@@ -92,7 +92,7 @@ class Common(NamedTuple):
         :param arguments: the agent's keyword arguments
         """
         noise = arguments["action_noise"]
-        deviation = noise if isinstance(noise, int | float) else 0.0
+        deviation = 0.0 if noise is None or isinstance(noise, ActionNoise) else float(noise)
         return Rollout(runner, missions, witness, self.store, deviation, RANDOM_ACTION_PROB, self.rng)
 
 

@@ -19,6 +19,8 @@ from stable_baselines3.common.utils import check_for_correct_spaces
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_skillgraph.goal_env import describe_space, make_space, refuse_changed_goals
+from sb3_skillgraph.learning.scale import LOOK_AT
+from sb3_skillgraph.metric import Metric, as_saved
 from sb3_skillgraph.options.learner import OptionDDPG, OptionLearner, OptionTD3
 from sb3_skillgraph.options.parameters import parameters, set_parameters
 from sb3_skillgraph.rules import PaperRules
@@ -70,13 +72,13 @@ def _update_path(learner: OffPolicyAlgorithm) -> str:
 def _arguments(agent: Any) -> dict[str, Any]:
     """Return the constructor's arguments; those of SB3 that are read from attributes while learning as they are now."""
     arguments = dict(agent._arguments)
-    for name in ("batch_size", "gamma", "gradient_steps", "learning_starts", "tau", "verbose"):
+    for name in ("batch_size", "gamma", "gradient_steps", "learning_rate", "learning_starts", "tau", "verbose"):
         arguments[name] = getattr(agent, name)
     arguments["train_freq"] = (agent.train_freq.frequency, agent.train_freq.unit.value)
-    arguments["event_radius"] = agent.metric.get_state()
+    arguments["event_radius"] = as_saved(agent.metric)
     if agent.rules is not None:
         arguments["rules"] = asdict(agent.rules)
-    if agent.action_noise is not None:
+    if agent.action_noise is not None or isinstance(arguments["action_noise"], ActionNoise):
         arguments["action_noise"] = agent.action_noise
     if agent.parts.view_name is not None:
         arguments["option_view"] = agent.parts.view_name
@@ -218,7 +220,8 @@ def copy(agent: Any, env: Any) -> Any:
     agent_file, replay_file = io.BytesIO(), io.BytesIO()
     agent.save(agent_file)
     agent.save_replay_buffer(replay_file)
-    twin = load(type(agent), agent_file, env, agent.device, kept_by_name(agent._arguments), force_reset=False)
+    given = {**kept_by_name(agent._arguments), "event_radius": agent.metric}
+    twin = load(type(agent), agent_file, env, agent.device, given, force_reset=False)
     twin.load_replay_buffer(replay_file)
     return twin
 
@@ -239,6 +242,8 @@ def _restore(agent: Any, tree: dict[str, Any], same_envs: bool) -> None:
         parts.missions.salience.set_state(progress["salience"])
     parts.rng.bit_generator.state = progress["rng"]
     parts.rollout.set_state(progress["rollout"], same_envs)
+    if agent.num_timesteps >= LOOK_AT:
+        parts.rollout.scale = None  # it has told what it saw
     if same_envs:
         agent._env_snapshot = progress["environments"]
     before = _generators()
@@ -320,7 +325,11 @@ def kept_by_name(arguments: dict[str, Any]) -> dict[str, Any]:
 
     :param arguments: of the constructor
     """
-    return {name: value for name, value in arguments.items() if callable(value) or hasattr(value, "propose")}
+    return {
+        name: value
+        for name, value in arguments.items()
+        if callable(value) or hasattr(value, "propose") or isinstance(value, Metric)
+    }
 
 
 def require_callables(arguments: Any, name: str = "") -> None:

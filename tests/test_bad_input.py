@@ -31,7 +31,8 @@ from conftest import (
 )
 from fuzz import members, packed
 from gymnasium import spaces
-from stable_baselines3 import DDPG
+from sb3_contrib import QRDQN
+from stable_baselines3 import DDPG, DQN
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
@@ -164,6 +165,15 @@ def test_refused_arguments(arguments: dict[str, Any]) -> None:
         dict(stats_window_size=-3),
         dict(shaping=float("inf")),
         dict(explore_beyond=float("inf")),
+        dict(action_noise=[0.2, 0.2]),
+        dict(action_noise=np.array(0.2)),
+        dict(action_noise={"sigma": 0.2}),
+        dict(action_noise=True),
+        dict(learning_rate=True),
+        dict(train_freq=True),
+        dict(seed=True),
+        dict(seed=1.5),
+        dict(verbose=3.5),
     ],
     ids=shown,
 )
@@ -171,6 +181,17 @@ def test_refused_arguments_that_are_no_such_numbers(arguments: dict[str, Any]) -
     name = next(iter(arguments))
     with pytest.raises(ValueError, match=name):
         new_agent(**arguments)
+
+
+def test_noise_may_be_any_number() -> None:
+    for noise in (0.2, np.float32(0.2), 1):
+        assert new_agent(action_noise=noise).parts.rollout.noise_std == pytest.approx(float(noise))
+
+
+@pytest.mark.parametrize("option_class", [DQN, QRDQN])
+def test_classes_for_other_actions_are_refused(option_class: Any) -> None:
+    with pytest.raises(ValueError, match=f"option_class {option_class.__name__} cannot be built for continuous actions"):
+        new_agent(option_class=option_class)
 
 
 def test_policy_of_another_kind() -> None:

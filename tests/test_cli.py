@@ -235,9 +235,12 @@ def test_the_package_is_the_command_line() -> None:
         (["train", TOY, "--steps", "0"], "at least 1"),
         (["train", TOY, "--env-kwargs", "maze=1"], "maze"),
         (["train", "SkillGraph/PointMaze-v0"], "maze_map is required"),
-        (["evaluate", "nothing.zip", "--env", TOY], "no file"),
-        (["plot", "nothing.zip", "--env", TOY, "--out", "x"], "no file"),
-        (["evaluate", "nothing.zip"], "say with --env"),
+        (["train", "FetchReech-v4"], "did you mean 'FetchReach-v4'"),
+        (["train", TOY, "--hyperparams", "tensorboard_log=tb"], "--tensorboard writes the log into OUT"),
+        (["train", TOY, "--hyperparams", "event_radius={parts: [{kind: Withn, dims: [0, 1], radius: 0.3}]}"], "not 'Withn'"),
+        (["evaluate", "nothing.zip", "--env", TOY], "there is no nothing.zip"),
+        (["plot", "nothing.zip", "--env", TOY, "--out", "x"], "there is no nothing.zip"),
+        (["evaluate", "nothing"], "there is no nothing: give a folder that train has filled, or an agent.zip"),
         (["train", TOY, "--steps", "1.5"], "whole number"),
         (["dance"], "dance"),
     ],
@@ -289,9 +292,36 @@ def test_a_run_knows_its_environment(folder: Path, tmp_path: Path, capsys: Captu
     assert "trained in" not in captured.out and "2/2" in captured.err  # the progress bar
     assert all(pair["steps"] <= 50 for pair in json.loads(result.read_text())["pairs"])  # its max_steps, too
     assert cli.main(["evaluate", str(folder), "--env", TOY, "--pairs", "1"]) == 0
-    assert f"note: the agent was trained in {TOY} {{'max_steps': 50}}" in capsys.readouterr().out
+    warning = f"warning: the agent was trained in {TOY} {{'max_steps': 50}}"
+    assert warning in capsys.readouterr().out
+    assert cli.main(["evaluate", str(folder), "--env-kwargs", "max_steps=4e1", "--pairs", "1"]) == 0
+    assert warning in capsys.readouterr().out
     assert cli.main(["plot", str(folder), "--out", str(tmp_path)]) == 0
     assert {path.name for path in tmp_path.iterdir()} >= PICTURES
+
+
+def test_a_folder_without_an_agent(folder: Path, tmp_path: Path, capsys: Capture) -> None:
+    assert f"there is no agent.zip in {tmp_path}" in error_line(capsys, ["evaluate", str(tmp_path), "--env", TOY])
+    (tmp_path / "checkpoint_300").mkdir()
+    argv = ["evaluate", str(tmp_path / "checkpoint_300")]
+    assert "there are checkpoints: checkpoint_300" in error_line(capsys, ["evaluate", str(tmp_path), "--env", TOY])
+    (tmp_path / "checkpoint_300" / "agent.zip").write_bytes((folder / "agent.zip").read_bytes())
+    assert "say with --env in which environment" in error_line(capsys, argv)
+
+
+def test_numbers_may_be_written_as_people_do(tmp_path: Path) -> None:
+    given = ["event_radius=3e-1", "learning_rate=1e-4", "train_freq=[1, episode]", "batch_size=1e1"]
+    argv = ["train", TOY, "--steps", "1e1", "--out", str(tmp_path), "--env-kwargs", "max_steps=2e1", "--hyperparams", *given]
+    assert cli.main(argv) == 0
+    agent = SkillGraphAgent.load(tmp_path / "agent.zip")
+    assert (agent.event_radius, agent.learning_rate, agent.batch_size) == (0.3, 1e-4, 10)
+    assert (agent.train_freq.frequency, agent.train_freq.unit.value) == (1, "episode")
+    assert json.loads((tmp_path / "config.json").read_text())["env_kwargs"] == {"max_steps": 20}
+
+
+def test_adaptation_needs_starts_and_goals_of_ones_choice(tmp_path: Path, capsys: Capture) -> None:
+    assert cli.main(["train", "FetchReach-v4", "--steps", "50", "--out", str(tmp_path)]) == 0
+    assert "must take start and goal" in error_line(capsys, ["evaluate", str(tmp_path), "--adapt", "10", "--pairs", "1"])
 
 
 def test_a_damaged_configuration_is_called_so(folder: Path, tmp_path: Path, capsys: Capture) -> None:

@@ -14,7 +14,8 @@ import sb3_skillgraph
 from sb3_skillgraph import SkillGraphAgent
 from sb3_skillgraph.baselines import StraightOn
 from sb3_skillgraph.envs import U_MAZE, MazeGeometry, MazeMap, find, geometry_of
-from sb3_skillgraph.evaluation import PairResult, PairsResult, SkillTrace, brier_score, evaluate_pairs, run_pair
+from sb3_skillgraph.evaluation import NoPairsError, PairResult, PairsResult, SkillTrace, brier_score, evaluate_pairs, run_pair
+from sb3_skillgraph.hyperparams import make_recommended
 from sb3_skillgraph.planning import DIRECT, GOAL
 
 CORRIDOR: MazeMap = [[1] * 9, [1, "r", 0, 0, 0, 0, 0, 0, 1], [1] * 9]
@@ -232,7 +233,8 @@ def test_environments_without_walls_draw_starts_and_goals_themselves(trained: Sk
     assert any(pair.success for pair in result.pairs)
     with pytest.raises(ValueError, match="does not tell when a goal is reached"):
         evaluate_pairs(RandomWalk(), Bare(), n_pairs=1)
-    with pytest.raises(ValueError, match="To adapt, the environment must take"):
+    assert evaluate_pairs(StraightOn(trained), Bare(), n_pairs=2).pairs  # the agent's radius is that of its walker
+    with pytest.raises(NoPairsError, match="To adapt, the environment must take"):
         gym.register("Bare-v0", Bare)
         evaluate_pairs(trained, "Bare-v0", n_pairs=1, adapt_timesteps=10)
 
@@ -262,9 +264,21 @@ def test_mazes_of_gymnasium_robotics_as_they_come() -> None:
     assert geometry_of(gym.make("CartPole-v1")) is None
 
 
+@pytest.mark.mujoco
+@pytest.mark.parametrize("env_id", ["AntMaze_UMaze-v5", "pointmaze-medium-v0", "FrankaKitchen-v1"])
+def test_an_id_gets_the_wrapper_that_is_recommended(env_id: str) -> None:
+    pytest.importorskip("ogbench")
+    find(env_id)
+    agent = new_agent(make_recommended(env_id, {}))
+    (pair,) = evaluate_pairs(agent, env_id, n_pairs=1).pairs
+    assert pair.steps <= agent.parts.planner.horizon
+
+
 def test_bad_arguments() -> None:
-    with pytest.raises(ValueError, match=r"goal environments .*Pendulum.* is none"):
+    with pytest.raises(ValueError, match=r"needs a goal environment"):
         evaluate_pairs(RandomWalk(), "Pendulum-v1")
+    with pytest.raises(ValueError, match=r"goal environments .*Pendulum.* is none"):
+        evaluate_pairs(RandomWalk(), gym.make("Pendulum-v1"))
     with pytest.raises(ValueError, match="too small"):
         evaluate_pairs(RandomWalk(), TOY, n_pairs=1, env_kwargs=dict(maze_map=[[1, 1, 1], [1, "r", 1], [1, 1, 1]]))
 

@@ -386,12 +386,19 @@ def test_workers_share_what_one_of_them_leaves_and_none_minds_a_damaged_folder(t
     assert Counter(run.state for run in status(specs, out)) == {"done": 4, "failed": 1}
 
 
+#: A maze, but none of ours.
+FOREIGN = {"theirs": {"id": "PointMaze_UMaze-v3", "steps": 400}}
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
         ({"methods": {"dsg": {"algorithm": "skil_graph"}}}, "unknown algorithm 'skil_graph'.*'skill_graph'"),
         ({"methods": {"dsg": {"algorithm": "skill_graph", "arguments": {"gama": 1}}}}, "unknown argument 'gama'"),
         ({"methods": {"flat": {"algorithm": "recipe", "arguments": {"gama": 1}}}}, "unknown argument 'gama'"),
+        ({"methods": {"flat": {"algorithm": "recipe"}}, "environments": FOREIGN}, "'recipe' is for SkillGraph/. mazes"),
+        ({"methods": {"dco": {"algorithm": "covering_options"}}, "environments": FOREIGN}, "for SkillGraph/. mazes"),
+        ({"environments": FOREIGN, "test_pairs": 1}, "test_pairs is for SkillGraph/. mazes, not for PointMaze_UMaze-v3"),
         ({"methods": {}}, "methods is missing"),
         ({"seeds": 3}, "seeds must be a list, not 3"),
         ({"check_every": 0}, "check_every must be a positive number, not 0"),

@@ -16,6 +16,7 @@ from sb3_skillgraph import graph as graph_module
 from sb3_skillgraph.edges import MAX_LANDINGS, NOWHERE, Edges
 from sb3_skillgraph.events import Event
 from sb3_skillgraph.graph import GROWTH, SPACING, YOUNG, SkillGraph
+from sb3_skillgraph.metric import MISMATCH, Exact, Product, Within
 
 every_time = settings(derandomize=True, deadline=None, max_examples=40, database=None)
 
@@ -26,6 +27,16 @@ def line(n_events: int, spacing: float = 2.0, **kwargs: Any) -> SkillGraph:
     for i in range(n_events):
         graph.add_event(np.array([spacing * i, 0.0]), salient=i in kwargs.get("salient", ()))
     return graph
+
+
+def test_events_that_only_what_has_to_match_tells_apart_are_not_merged() -> None:
+    graph = SkillGraph(2, Product(Within((0,), 1.0), Exact((1,))), 10)
+    for i in range(10):
+        graph.add_event(np.array([0.0, i]), salient=False)
+    with pytest.raises(ValueError, match=r"more values than max_events=10"):
+        while len(graph.events) == 10:
+            graph.coarsen()
+    assert len(graph.events) == 10 and graph.cover_radius < MISMATCH
 
 
 def record(graph: SkillGraph, source: int, target: int) -> dict[str, float]:

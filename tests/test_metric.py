@@ -23,6 +23,7 @@ from sb3_skillgraph.metric import (
     Metric,
     Product,
     Rotation,
+    Tilt,
     Within,
     as_metric,
 )
@@ -184,7 +185,86 @@ def test_poses_of_a_hand_are_reached_where_the_environment_says_so(id: str) -> N
     assert 200 < sum(reached) < 800
 
 
+def test_how_a_pen_lies_is_reached_where_its_environment_says_so() -> None:
+    import gymnasium_robotics
+
+    gym.register_envs(gymnasium_robotics)
+    env = gym.make("HandManipulatePen-v1")
+    metric = env_metric(lambda name: getattr(env.unwrapped, name, None), 7)
+    assert isinstance(metric, Product) and isinstance(metric.parts[1], Tilt)
+    rng, agreed, reached = np.random.default_rng(0), [], []
+    for _ in range(1_000):
+        goal = rng.normal(size=7)
+        goal[3:] /= np.linalg.norm(goal[3:])
+        axis, angle, spin = rng.normal(size=3), 0.1 * rng.uniform(0.9, 1.1), 0.5 * rng.uniform(0.0, 2.0 * np.pi)
+        turn = np.array([math.cos(angle / 2.0), *(math.sin(angle / 2.0) * axis / np.linalg.norm(axis))])
+        about_itself = np.array([math.cos(spin), 0.0, 0.0, math.sin(spin)])
+        rotation = quaternion_product(quaternion_product(turn, goal[3:]), about_itself)
+        point = np.concatenate([goal[:3], rotation])
+        # Theirs takes a quaternion and its negative for two rotations
+        negative = np.concatenate([goal[:3], -goal[3:]])
+        theirs = any(env.unwrapped._is_success(point, same) for same in (goal, negative))  # type: ignore[attr-defined]
+        agreed.append(theirs == metric.reached(point, goal))
+        reached.append(theirs)
+    env.close()
+    assert all(agreed)
+    assert 200 < sum(reached) < 950
+
+
+def test_a_task_is_asked_last_since_it_may_not_leave_its_process() -> None:
+    told = {"success_radius": 0.3}
+
+    def get(name: str) -> Any:
+        assert name not in ("task", "maze")
+        return told.get(name)
+
+    assert env_metric(get, 2) == Ball(0.3)
+
+
 # -- agents -----------------------------------------------------------------------------------------------------------
+
+
+class Taxicab(Ball):
+    """A user's own metric."""
+
+    def distance(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        return np.abs(a - b).sum(axis=-1)
+
+    def reached(self, point: np.ndarray, goal: np.ndarray) -> bool:
+        return bool(self.distance(point, goal) <= self.radius)
+
+
+class Loose(Within):
+    """A user's own part of one."""
+
+
+@pytest.mark.parametrize("metric", [Taxicab(0.45), Product(Loose((0, 1), 0.45))], ids=["metric", "part"])
+def test_a_metric_of_ones_own_class_is_asked_for_again(metric: Metric) -> None:
+    env = gym.make(TOY)
+    agent = SkillGraphAgent("MultiInputPolicy", env, event_radius=metric, policy_kwargs=dict(net_arch=[16, 16]), seed=0)
+    file = io.BytesIO()
+    agent.save(file)
+    with pytest.raises(ValueError, match=r"event_radius=.* again"):
+        SkillGraphAgent.load(io.BytesIO(file.getvalue()), env=env)
+    loaded = SkillGraphAgent.load(io.BytesIO(file.getvalue()), env=env, event_radius=metric)
+    assert loaded.metric is metric
+    assert agent.copy(gym.make(TOY)).metric is metric
+
+
+@pytest.mark.parametrize(
+    ("radius", "message"),
+    [
+        ([0.3], "1 radii for goals that have 2"),
+        ([0.3, 0.3, 0.3], "3 radii for goals that have 2"),
+        (lambda a, b: np.linalg.norm(a - b), r"shape \(3, 2, 2\) it returned shape \(\)"),
+        ({"parts": [{"kind": "Withn", "dims": [0, 1], "radius": 0.3}]}, "not 'Withn'"),
+        ({"parts": [{"kind": "Within", "dims": [0, 1]}]}, "Within cannot be made"),
+    ],
+    ids=["few", "many", "one for all", "kind", "radius"],
+)
+def test_what_is_no_metric_of_these_goals(radius: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        SkillGraphAgent("MultiInputPolicy", gym.make(TOY), event_radius=radius)
 
 
 def test_networks_see_goals_of_a_users_own_metric_in_its_units() -> None:

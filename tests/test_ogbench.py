@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 from conftest import differences, new_agent
 from stable_baselines3.common.env_checker import check_env
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import SubprocVecEnv
 
 from sb3_skillgraph.envs import find
 from sb3_skillgraph.envs.ogbench_mazes import OGBenchMazeEnv
@@ -103,11 +105,29 @@ def test_walls_and_tasks_are_those_of_ogbench(env_id: str) -> None:
 def test_ogbenchs_own_names_stand_for_the_adapter(env_id: str, ours: str) -> None:
     find(env_id)
     env, known = make_recommended(env_id, {}), gym.make(ours)
-    assert isinstance(env, OGBenchMazeEnv)
+    assert isinstance(env.unwrapped, OGBenchMazeEnv)
     settings, wanted = load_hyperparams(env_id), load_hyperparams(ours)
     assert settings == wanted
     assert same(env.reset(seed=3)[0], known.reset(seed=3)[0])
     assert same(env.step(env.action_space.high), known.step(env.action_space.high))
+
+
+def test_ogbenchs_own_arguments_hold_for_the_adapter() -> None:
+    find("pointmaze-medium-v0")
+    env = make_recommended("pointmaze-medium-v0", dict(max_episode_steps=50, terminate_at_goal=True))
+    assert (env.unwrapped.max_steps, env.unwrapped.terminate_on_success) == (50, True)  # type: ignore[attr-defined]
+    env = make_recommended("pointmaze-medium-v0", {})
+    assert (env.unwrapped.max_steps, env.unwrapped.terminate_on_success) == (1000, False)  # type: ignore[attr-defined]
+    assert env.spec is not None
+    gym.make(env.spec).close()  # as adaptation does
+
+
+def test_an_agent_in_processes_of_their_own() -> None:
+    env = make_vec_env("sb3_skillgraph:" + POINT, 2, vec_env_cls=SubprocVecEnv)
+    try:
+        assert new_agent(env).event_radius == 1.0
+    finally:
+        env.close()
 
 
 @pytest.mark.parametrize("name", ["humanoidmaze-medium-v0", "antsoccer-arena-v0", "cube-single-v0", ""])

@@ -153,12 +153,20 @@ def test_arguments_given_at_loading_win(trained_files: tuple[Path, Path], how: s
 
 
 def test_attributes_that_were_set_are_saved(trained: SkillGraphAgent, tmp_path: Path) -> None:
-    changes = dict(batch_size=64, gradient_steps=3, learning_starts=77, verbose=1)
+    changes = dict(batch_size=64, gradient_steps=3, learning_starts=77, learning_rate=1e-5, verbose=1)
     for name, value in changes.items():
         setattr(trained, name, value)
     trained.save(tmp_path / "agent")
     loaded = SkillGraphAgent.load(tmp_path / "agent")
     assert {name: getattr(loaded, name) for name in changes} == changes
+
+
+def test_noise_that_was_taken_away_stays_away(tmp_path: Path) -> None:
+    agent = new_agent(action_noise=NormalActionNoise(np.zeros(2), np.ones(2)))
+    agent.action_noise = None
+    agent.save(tmp_path / "agent")
+    loaded = SkillGraphAgent.load(tmp_path / "agent")
+    assert loaded.action_noise is None and loaded.parts.rollout.noise_std == 0.0
 
 
 @pytest.mark.parametrize("given", ["OptionTD3", "SAC", "DDPG"])

@@ -1,6 +1,7 @@
 """The agent tells early, once and with numbers, where the event radius does not fit what it moves."""
 
 import warnings
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -78,3 +79,14 @@ def test_radii_that_fit_and_that_do_not() -> None:
     assert (
         "large for this environment" in learn(gym.make(TOY, maze_map=[[1, 1, 1], [1, 0, 1], [1, 1, 1]]), event_radius=5.0)[0]
     )
+
+
+def test_it_is_told_after_loading_too(tmp_path: Path) -> None:
+    given: dict[str, Any] = dict(learning_starts=2 * LOOK_AT, option_view="relative", seed=0)
+    agent = SkillGraphAgent("MultiInputPolicy", Pinned(gym.make(TOY)), **given).learn(100)
+    agent.save(tmp_path / "agent")
+    loaded = SkillGraphAgent.load(tmp_path / "agent", env=Pinned(gym.make(TOY)))
+    with pytest.warns(UserWarning, match="hardly moves"):
+        loaded.learn(LOOK_AT + 50, reset_num_timesteps=False)
+    loaded.save(tmp_path / "agent")
+    assert SkillGraphAgent.load(tmp_path / "agent", env=Pinned(gym.make(TOY))).parts.rollout.scale is None

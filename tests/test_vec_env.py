@@ -1,5 +1,8 @@
 """The agent's own VecEnv gives what SB3's gives."""
 
+import subprocess
+import sys
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -76,3 +79,23 @@ def test_the_agent_wraps_what_is_no_vec_env_yet() -> None:
         vec_env = SkillGraphAgent("MultiInputPolicy", env, **SMALL).get_env()
         assert isinstance(vec_env, VecEnv)
         assert type(vec_env) is kind
+
+
+def test_processes_that_never_imported_us_find_our_environments(tmp_path: Path) -> None:
+    """Gymnasium has no plugins: the package that an id names before its colon is imported where the environment is made."""
+    script = tmp_path / "script.py"
+    script.write_text(
+        """
+import sys
+
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import SubprocVecEnv
+
+if __name__ == "__main__":
+    env = make_vec_env("sb3_skillgraph:SkillGraph/ToyMaze-v0", 2, vec_env_cls=SubprocVecEnv)
+    assert env.reset()["achieved_goal"].shape == (2, 2)
+    assert "sb3_skillgraph" not in sys.modules
+    env.close()
+"""
+    )
+    subprocess.run([sys.executable, str(script)], check=True)

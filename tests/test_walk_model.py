@@ -47,6 +47,22 @@ def test_before_any_run_all_walks_are_those_of_a_hardly_trained_policy() -> None
     np.testing.assert_array_equal(model.loss, [HASTY_LOSS, 0.0])
 
 
+def test_what_nobody_has_seen_change_is_not_believed_to_change() -> None:
+    """A walk that would fetch a key is guessed by a prior of its own, for each of what has to match."""
+    model = WalkModel(n_matched=2)
+
+    def rate(forward: float, *changes: bool) -> float:
+        kind = Kind(*(np.array([x]) for x in (4.0, 20.0, forward, 1.0)), np.array([changes]))
+        return float(model.success(kind)[0])
+
+    known = Kind(*np.array([[4.0, 20.0, 5.0, 5.0]] * 20).T, np.zeros((20, 2), dtype=bool))
+    model.fit(known, np.full(20, 5.0), np.zeros(20), np.full(20, 100.0))
+    same = rate(0.0, False, False)
+    assert rate(0.0, True, False) < 0.5 * same
+    assert rate(0.0, False, True) < 0.5 * same
+    assert rate(1.0, True, False) > 0.9 * rate(1.0, False, False)  # it was seen
+
+
 def test_without_runs_nothing_is_learned() -> None:
     model = WalkModel()
     before = copy.deepcopy(model.get_state())

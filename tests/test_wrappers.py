@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 from conftest import TOY
 from gymnasium import spaces
-from gymnasium.wrappers import TransformAction
+from gymnasium.wrappers import TimeLimit, TransformAction
 
 import sb3_skillgraph.envs.mujoco_mazes  # noqa: F401 (imports gymnasium-robotics, which registers its ants)
 from sb3_skillgraph import SkillGraphAgent, evaluate_pairs
 from sb3_skillgraph.envs import AntRecipe, FlattenGoals, HoldAction, Parking, PursueGoals, TellStuck, on_its_back
+from sb3_skillgraph.envs.wrappers import time_limit
 from sb3_skillgraph.goal_env import metric_of
 from sb3_skillgraph.hyperparams import load_hyperparams, make_recommended, recommended_wrapper
 from sb3_skillgraph.metric import Ball
@@ -54,6 +55,20 @@ def test_an_action_is_held_until_the_episode_is_over(kwargs: dict[str, int], exp
 def test_an_action_is_held_for_a_step_at_least(n_steps: Any) -> None:
     with pytest.raises(ValueError, match=f"n_steps must be a whole number of steps, at least 1, not {n_steps!r}"):
         HoldAction(Counter(), n_steps)
+
+
+@pytest.mark.parametrize(("limit", "n_steps", "steps"), [(7, 1, 7), (7, 2, 4), (8, 2, 4), (None, 2, None)])
+def test_held_actions_make_episodes_of_fewer_steps(limit: int | None, n_steps: int, steps: int | None) -> None:
+    env: Any = Counter(ends=99) if limit is None else TimeLimit(Counter(ends=99), limit)
+    held = HoldAction(HoldAction(env, 1), n_steps)
+    assert time_limit(held) == steps
+    assert time_limit(TimeLimit(held, 2)) == 2
+
+
+def test_an_agent_plans_for_episodes_as_long_as_they_are() -> None:
+    held = HoldAction(gym.make(TOY, max_steps=50), 3)
+    for env, horizon in ((held, 17), (TimeLimit(held, 9), 9)):
+        assert SkillGraphAgent("MultiInputPolicy", env).parts.planner.horizon == horizon
 
 
 def test_an_environment_with_wrappers_is_made_again_from_its_spec() -> None:
@@ -198,6 +213,7 @@ class Car(gym.Env):
     """highway-env's parking-v0, as far as it can be told from outside: it crashes at its second step."""
 
     def __init__(self) -> None:
+        self.config = {"duration": 100, "policy_frequency": 5}
         space = spaces.Box(-np.inf, np.inf, (6,), np.float64)
         self.observation_space = spaces.Dict(observation=space, achieved_goal=space, desired_goal=space)
         self.action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
@@ -218,6 +234,7 @@ class Car(gym.Env):
 
 def test_a_crashed_car_is_stuck() -> None:
     env = Parking(Car())
+    assert env.max_steps == 500  # 100 seconds
     env.reset(seed=0)
     assert env.step(np.zeros(2, dtype=np.float32))[4]["stuck"] is False
     assert env.step(np.zeros(2, dtype=np.float32))[4]["stuck"] is True
@@ -295,7 +312,7 @@ def test_an_agent_learns_to_pursue_the_goals() -> None:
     [
         (dict(sample_goal=lambda rng: np.zeros(2)), r"shape \(1,\) and sampled ones \(2,\)"),
         (dict(achieved_goal=lambda o: o[0]), "both must be"),
-        (dict(radius=[0.1, 0.1]), "dimension 1"),
+        (dict(radius=[0.1, 0.1]), "2 radii for goals that have 1"),
         (dict(radius=-1.0), "positive"),
     ],
 )

@@ -4,6 +4,7 @@ import numpy as np
 
 from sb3_skillgraph.agent import SkillGraphAgent
 from sb3_skillgraph.goal_env import as_batch
+from sb3_skillgraph.metric import Metric
 
 
 class StraightOn:
@@ -15,6 +16,11 @@ class StraightOn:
 
     def __init__(self, agent: SkillGraphAgent) -> None:
         self.agent = agent
+
+    @property
+    def metric(self) -> Metric:
+        """How near to a goal is there: the agent's."""
+        return self.agent.metric
 
     def predict(
         self,

@@ -20,14 +20,22 @@ _FULL_STATE = mujoco.mjtState.mjSTATE_INTEGRATION
 _BODIES: dict[str, tuple[int, str, float]] = {"point": (0, "relative", 0.7), "ant": (2, "placed_body", 0.9)}
 
 
-def adapted(env: gym.Env) -> "OGBenchMazeEnv":
+def adapted(env: gym.Env) -> gym.Env:
     """Return the goal environment that there is in place of OGBench's own, which is closed.
+
+    What OGBench was told of the end of an episode (``max_episode_steps``, ``terminate_at_goal``) holds for it, too.
 
     :param env: ``pointmaze-*`` or ``antmaze-*`` as OGBench makes it
     """
-    assert env.spec is not None
+    spec = env.spec
+    assert spec is not None
     env.close()
-    return OGBenchMazeEnv(env.spec.id, env.render_mode)
+    given: dict[str, Any] = {"terminate_on_success": bool(spec.kwargs.get("terminate_at_goal", False))}
+    if spec.max_episode_steps:
+        given["max_steps"] = spec.max_episode_steps
+    body, maze = spec.id.split("maze-")
+    kind, size = body.capitalize(), maze.partition("-")[0].capitalize()
+    return gym.make(f"SkillGraph/OGBench{kind}{size}-v0", render_mode=env.render_mode, **given)
 
 
 class OGBenchMazeEnv(GoalTask):

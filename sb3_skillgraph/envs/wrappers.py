@@ -9,7 +9,18 @@ from gymnasium import spaces
 
 from sb3_skillgraph.metric import Direction, Product, Within, as_metric
 
+#: Names under which environments tell after how many steps an episode is truncated.
+TIME_LIMITS = ("max_steps", "_max_episode_steps")
 _UPRIGHT = 0.2  # upward component of the torso's axis below which it lies on its side or back
+
+
+def time_limit(env: gym.Env) -> int | None:
+    """Return after how many steps an environment truncates an episode; None if it does not tell.
+
+    :param env: any environment
+    """
+    limits = [env.get_wrapper_attr(name) for name in TIME_LIMITS if env.has_wrapper_attr(name)]
+    return min((int(limit) for limit in limits if limit), default=None)
 
 
 class HoldAction(gym.Wrapper, gym.utils.RecordConstructorArgs):
@@ -27,6 +38,17 @@ class HoldAction(gym.Wrapper, gym.utils.RecordConstructorArgs):
         if not isinstance(n_steps, int | np.integer) or n_steps < 1:
             raise ValueError(f"n_steps must be a whole number of steps, at least 1, not {n_steps!r}.")
         self.n_steps = n_steps
+
+    @property
+    def max_steps(self) -> int:
+        """Time limit, in steps of this environment.
+
+        :raises AttributeError: if the wrapped environment names none
+        """
+        limit = time_limit(self.env)
+        if limit is None:
+            raise AttributeError("the wrapped environment names no time limit")
+        return -(-limit // self.n_steps)
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Take the same action again and again, until the episode is over or the agent is stuck.
@@ -139,7 +161,7 @@ class FlattenGoals(gym.ObservationWrapper, gym.utils.RecordConstructorArgs):
 
     :param env: an environment whose goals are Dicts of Boxes
     :param radius: of every entry, in its own units, or of each by name
-    :raises ValueError: if its goals are no such dictionaries
+    :raises ValueError: if its goals are no such dictionaries, or the names are others
     """
 
     def __init__(self, env: gym.Env, radius: float | dict[str, float]) -> None:
@@ -152,6 +174,8 @@ class FlattenGoals(gym.ObservationWrapper, gym.utils.RecordConstructorArgs):
         flat = spaces.flatten_space(goals)
         self.observation_space = spaces.Dict({**space.spaces, "achieved_goal": flat, "desired_goal": flat})
         self._goals = goals
+        if isinstance(radius, dict) and set(radius) != set(goals.spaces):
+            raise ValueError(f"There must be a radius for each of {', '.join(goals.spaces)}, not for {', '.join(radius)}.")
         parts, first = [], 0
         for name, box in goals.spaces.items():
             last = first + spaces.flatdim(box)
@@ -195,6 +219,12 @@ class Parking(gym.Wrapper, gym.utils.RecordConstructorArgs):
     def __init__(self, env: gym.Env) -> None:
         gym.utils.RecordConstructorArgs.__init__(self)
         gym.Wrapper.__init__(self, env)
+
+    @property
+    def max_steps(self) -> int:
+        """Steps after which it gives up: its limit is in seconds."""
+        config = self.env.get_wrapper_attr("config")
+        return int(config["duration"] * config["policy_frequency"])
 
     def step(self, action: np.ndarray) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Take a step.
@@ -247,12 +277,15 @@ class PursueGoals(gym.Wrapper, gym.utils.RecordConstructorArgs):
 
         :param seed: seed of the environment and of the goals
         :param options: ``"goal"``, shape ``(goal_dim,)``; what else there is goes to the wrapped environment
+        :raises ValueError: if a goal of another shape is given
         """
         options = dict(options or {})
         given = options.pop("goal", None)
         observation, info = self.env.reset(seed=seed, options=options or None)
         drawn = self._drawn(self.np_random)
         self.goal = drawn if given is None else np.asarray(given, dtype=np.float64)
+        if self.goal.shape != drawn.shape:
+            raise ValueError(f"A goal has shape {drawn.shape}, and {given!r} has {self.goal.shape}.")
         shown = self._shown(observation)
         return shown, {**info, "is_success": self._is_reached(shown)}
 

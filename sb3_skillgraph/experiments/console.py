@@ -1,6 +1,7 @@
 """What all commands share: errors for people, arguments in YAML, and the versions in use."""
 
 import argparse
+import re
 import subprocess
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -56,6 +57,21 @@ def positive(text: str) -> int:
     return int(number)
 
 
+def numbers(value: Any) -> Any:
+    """Return a value with numbers in place of texts such as ``1e4``, which YAML takes for no number without a dot.
+
+    :param value: as YAML gives it
+    """
+    if isinstance(value, list):
+        return [numbers(item) for item in value]
+    if isinstance(value, dict):
+        return {name: numbers(item) for name, item in value.items()}
+    if not (isinstance(value, str) and re.fullmatch(r"[-+]?[0-9][0-9_]*e[-+]?[0-9]+", value, re.IGNORECASE)):
+        return value
+    number = float(value)
+    return int(number) if number.is_integer() else number
+
+
 def assignment(text: str) -> tuple[str, Any]:
     """Read ``NAME=VALUE``, the value in YAML.
 
@@ -65,6 +81,6 @@ def assignment(text: str) -> tuple[str, Any]:
     if not (name and equals):
         raise argparse.ArgumentTypeError(f"{text!r} is not of the form NAME=VALUE")
     try:
-        return name, yaml.safe_load(value)
+        return name, numbers(yaml.safe_load(value))
     except yaml.YAMLError as error:
         raise argparse.ArgumentTypeError(f"the value of {name} is no valid YAML: {value!r}") from error

@@ -9,7 +9,7 @@ import gymnasium as gym
 from sb3_skillgraph.agent import SkillGraphAgent
 from sb3_skillgraph.envs import find
 from sb3_skillgraph.experiments.console import UserError, assignment, for_people
-from sb3_skillgraph.experiments.run_folder import AGENT, CONFIG, run_config
+from sb3_skillgraph.experiments.run_folder import AGENT, CONFIG, checkpoints, run_config
 from sb3_skillgraph.hyperparams import did_you_mean, make_recommended
 
 
@@ -72,7 +72,7 @@ def check_env_id(env_id: str) -> None:
     try:
         find(env_id)
     except (gym.error.Error, ImportError) as error:
-        known = [id for id in gym.registry if id.rpartition("/")[0] or "Maze" in id]
+        known = list(gym.registry)
         short = {id.rpartition("/")[2]: id for id in known}
         hint = did_you_mean(env_id, known) or did_you_mean(env_id.rpartition("/")[2], short)
         reason = f": {error}" if isinstance(error, ImportError) else ""
@@ -87,6 +87,11 @@ def find_run(args: argparse.Namespace) -> tuple[Path, str, dict[str, Any]]:
     :raises UserError: if it is not known which environment
     """
     path = args.agent / AGENT if args.agent.is_dir() else args.agent
+    if not args.agent.exists():
+        raise UserError(f"there is no {args.agent}: give a folder that train has filled, or an agent.zip.")
+    if not path.exists():
+        inside = ", ".join(folder.name for folder in checkpoints(args.agent).values())
+        raise UserError(f"there is no {AGENT} in {args.agent}" + (f"; there are checkpoints: {inside}." if inside else "."))
     config: dict[str, Any] = {}
     if path.with_name(CONFIG).exists():
         with for_people():
@@ -97,10 +102,12 @@ def find_run(args: argparse.Namespace) -> tuple[Path, str, dict[str, Any]]:
             raise UserError(
                 f"{path} was not left there by train (no {CONFIG} beside it): say with --env in which environment."
             )
-        return path, str(config["env"]), {**config["env_kwargs"], **asked}
-    if config and (args.env, asked) != (config["env"], config["env_kwargs"]):
-        print(f"note: the agent was trained in {config['env']} {config['env_kwargs'] or ''}")
-    return path, str(args.env), asked
+        env_id, env_kwargs = str(config["env"]), {**config["env_kwargs"], **asked}
+    else:
+        env_id, env_kwargs = str(args.env), asked
+    if config and (env_id, env_kwargs) != (config["env"], config["env_kwargs"]):
+        print(f"warning: the agent was trained in {config['env']} {config['env_kwargs'] or ''}")
+    return path, env_id, env_kwargs
 
 
 def make_env(env_id: str, env_kwargs: dict[str, Any]) -> gym.Env:

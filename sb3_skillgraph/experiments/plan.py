@@ -17,6 +17,7 @@ from sb3_skillgraph.hyperparams import did_you_mean
 _COMMON = ("check_every", "pairs", "final_pairs", "task_episodes", "test_pairs", "test_stretches")
 _TOP = {"methods": dict, "environments": dict, "seeds": list, **dict.fromkeys(_COMMON, int)}
 _METHOD = {"algorithm": str, "arguments": dict, "also": dict, "seeds": list}
+_NEEDS_MAZE = ("recipe", "covering_options")
 _ALSO = {"algorithm": str, "arguments": dict}
 _ENVIRONMENT = {
     "id": str,
@@ -37,13 +38,13 @@ class RunSpec:
     :param environment: its name in the plan
     :param seed: of everything random; pairs are drawn with ``seed + 1000``
     :param algorithm: ``skill_graph``, ``uvfa``, ``her``, ``recipe``, ``covering_options`` or ``random_walk``
-    :param env_id: id of a ``SkillGraph/*`` environment
+    :param env_id: id of a goal environment
     :param steps: environment steps
     :param check_every: steps between tests, after each of which a checkpoint is taken
     :param pairs: pairs of start and goal in these tests
     :param final_pairs: pairs in the last one
     :param task_episodes: episodes, in each test, of every task that the environment brings (OGBench's do)
-    :param test_pairs: pairs with each of which, after that, a copy goes on learning
+    :param test_pairs: pairs with each of which, after that, a copy goes on learning (on ``SkillGraph/*`` mazes)
     :param test_stretches: for how many times 1000 steps, with a test after each
     :param arguments: of the algorithm
     :param env_kwargs: of the environment
@@ -134,7 +135,19 @@ def load_plan(path: Path) -> list[RunSpec]:
             for name in env.get("methods", methods)
             if seed in methods[name].get("seeds", [seed])
         ]
+    for spec in specs:
+        _check_task(spec, path)
     return specs
+
+
+def _check_task(spec: RunSpec, path: Path) -> None:
+    """Refuse what needs a maze of ours, where start and goal can be given, on any other environment."""
+    if spec.env_id.startswith("SkillGraph/"):
+        return
+    asked = f"the algorithm {spec.algorithm!r}" if spec.algorithm in _NEEDS_MAZE else "test_pairs" if spec.test_pairs else ""
+    if asked:
+        where = f"{path}, environment {spec.environment!r}"
+        raise ValueError(f"{where}: {asked} is for SkillGraph/* mazes, not for {spec.env_id}.")
 
 
 def _check_also(method: dict[str, Any], where: str) -> None:

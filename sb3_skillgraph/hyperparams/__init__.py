@@ -35,10 +35,11 @@ def load_hyperparams(env_id: str, path: Path = FILE, *, required: bool = False) 
         that is required
     """
     document = _read(path)
-    if required and env_id not in document:
+    own = _entry_of(env_id, document)
+    if required and own not in document:
         raise ValueError(f"{path.name} has no entry {env_id!r}{did_you_mean(env_id, document)}.")
     hyperparams: dict[str, Any] = {}
-    for entry in ("defaults", _entry_of(env_id, document)):
+    for entry in ("defaults", own):
         values = document.get(entry) or {}
         if not isinstance(values, dict):
             raise ValueError(f"{path.name}, entry {entry!r}: a mapping of argument names to values is wanted.")
@@ -120,6 +121,8 @@ def check_hyperparams(values: dict[str, Any], origin: str) -> dict[str, Any]:
 
 def _number(name: str, value: Any, origin: str) -> Any:
     """Return a value as the number its argument wants; YAML takes ``1e-3``, without a dot, for a string."""
+    if name == "train_freq" and isinstance(value, list):
+        return tuple(value)  # such as (1, "episode")
     parameter = _PARAMETERS.get(name)
     default = parameter.default if parameter is not None else 0  # n_timesteps
     optional = parameter is not None and "None" in str(parameter.annotation)

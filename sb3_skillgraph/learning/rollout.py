@@ -241,7 +241,6 @@ class Rollout:
         :param state: the state
         :param same_envs: whether the environments go on where they were; else they begin anew
         """
-        self.scale = None  # a warning at the begin of learning is enough
         self.n_stuck, self.ran, self.n_steps = state["n_stuck"], dict(state["ran"]), state["n_steps"]
         self.witness.set_state(state["witness"])
         self.missions.set_state(state["missions"])

@@ -112,7 +112,13 @@ class OptionFactory:
         with th.random.fork_rng(devices=[]):
             # Initial weights come from our own generator, so that loading an agent draws nothing from torch's.
             th.manual_seed(int(self.rng.integers(2**31)))
-            learner._setup_model()
+            try:
+                learner._setup_model()
+            except AttributeError as error:  # DQN and its kin ask how many actions there are
+                raise ValueError(
+                    f"option_class {self.option_class.__name__} cannot be built for continuous actions ({error}): use one of "
+                    "OptionDDPG, OptionTD3, DDPG, TD3, SAC, or another class for Box actions."
+                ) from error
         learner.set_logger(Logger(folder=None, output_formats=[]))
         learner.policy.set_training_mode(False)
         return learner
