@@ -19,7 +19,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 from stable_baselines3.td3.policies import MultiInputPolicy
 
 from sb3_skillgraph import persistence
-from sb3_skillgraph.arguments import check_arguments
+from sb3_skillgraph.arguments import check_arguments, check_attributes
 from sb3_skillgraph.events import Event
 from sb3_skillgraph.goal_env import GoalSpec, as_batch, as_goal, check_finite, refuse_changed_goals, rows, with_terminal
 from sb3_skillgraph.interrupts import Interrupts
@@ -138,7 +138,8 @@ class SkillGraphAgent(OffPolicyAlgorithm):
     ) -> None:
         # The keyword arguments as given: what is saved, and what load() builds the agent from.
         self._arguments = {k: v for k, v in locals().items() if k not in ("self", "env", "_init_setup_model", "__class__")}
-        if isinstance(policy, str) and policy not in self.policy_aliases:
+        is_class = isinstance(policy, type) and issubclass(policy, BasePolicy)
+        if not is_class and policy not in self.policy_aliases:
             raise ValueError(f"Unknown policy {policy!r}: goal environments have Dict observations, use 'MultiInputPolicy'.")
         check_arguments(self._arguments)
         refuse_changed_goals(env)
@@ -177,7 +178,8 @@ class SkillGraphAgent(OffPolicyAlgorithm):
             self._setup_model()
 
     def __repr__(self) -> str:
-        return f"<SkillGraphAgent after {self.num_timesteps} steps: {self.graph}>"
+        graph = self.graph if hasattr(self, "parts") else "not set up"
+        return f"<SkillGraphAgent after {self.num_timesteps} steps: {graph}>"
 
     @staticmethod
     def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
@@ -279,6 +281,7 @@ class SkillGraphAgent(OffPolicyAlgorithm):
         tb_log_name: str = "run",
         progress_bar: bool = False,
     ) -> tuple[int, BaseCallback]:
+        check_attributes(self)
         rollout = self.parts.rollout
         if not reset_num_timesteps:
             # A call may overshoot by part of a roll-out; two calls of N then still end where one of 2N does.
@@ -436,8 +439,15 @@ class SkillGraphAgent(OffPolicyAlgorithm):
     def _running_state(self, n_envs: int, state: tuple[np.ndarray, ...] | None) -> RunnerState:
         if state is None:
             return RunnerState.fresh(n_envs, self._spec.goal_dim, self._spec.observation_dim)
-        if len(state) != len(RunnerState._fields) or len(state[0]) != n_envs:
-            raise ValueError(f"The state is not one that predict has returned for {n_envs} environments.")
+        known = self._known_state(state)
+        if len(known.option) != n_envs:
+            raise ValueError(f"The state is of {len(known.option)} environments, not of {n_envs}.")
+        return known
+
+    @staticmethod
+    def _known_state(state: Any) -> RunnerState:
+        if not isinstance(state, tuple) or len(state) != len(RunnerState._fields):
+            raise ValueError(f"This is no state that predict has returned: {state!r:.60}.")
         return RunnerState(*state)
 
     def running(self, state: tuple[np.ndarray, ...]) -> list[str]:
@@ -446,8 +456,9 @@ class SkillGraphAgent(OffPolicyAlgorithm):
 
         :param state: what :meth:`predict` returned
         :return: the option's id for each environment
+        :raises ValueError: if it is no such state
         """
-        return [str(option) for option in RunnerState(*state).option]
+        return [str(option) for option in self._known_state(state).option]
 
     def plan(
         self, obs: dict[str, np.ndarray], goal: np.ndarray | None = None, state: tuple[np.ndarray, ...] | None = None
@@ -499,8 +510,10 @@ class SkillGraphAgent(OffPolicyAlgorithm):
         :param total_timesteps: environment steps
         :param callback: SB3 callback(s)
         :return: the agent
-        :raises ValueError: if the goal or the start is not a finite vector of goal space
+        :raises ValueError: if the goal or the start is not a finite vector of goal space, or there are no steps
         """
+        if total_timesteps < 1:
+            raise ValueError(f"total_timesteps must be 1 at least, not {total_timesteps!r}.")
         target = as_goal(goal, self._spec.goal_dim)
         assert self.env is not None, "Give the agent an environment (set_env) before adapt."
         self.episodes.reset_options = {} if start is None else {"start": as_goal(start, self._spec.goal_dim)}
@@ -547,7 +560,9 @@ class SkillGraphAgent(OffPolicyAlgorithm):
         exactly where it was. Constructor arguments that are excluded take their defaults when the file is loaded.
 
         :raises OSError: if the file cannot be written; an old file of that name is then untouched
+        :raises ValueError: if an attribute holds what SB3 cannot use
         """
+        check_attributes(self)
         tree = persistence.agent_tree(self, set(exclude or ()) - set(include or ()))
         check_learned(self, tree, None)  # what load would refuse is not written
         save_tree(path, "agent", tree, by_name=("arguments",))

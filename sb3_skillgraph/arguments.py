@@ -8,6 +8,7 @@ from gymnasium import spaces
 from stable_baselines3 import DDPG, SAC, TD3
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.type_aliases import TrainFreq
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_skillgraph.envs.wrappers import TIME_LIMITS
@@ -84,15 +85,38 @@ def check_arguments(arguments: dict[str, Any]) -> None:
     is_rate = isinstance(rate, int | float | np.number) and not isinstance(rate, bool) and 0 <= rate <= FASTEST
     if not callable(rate) and not is_rate:
         raise ValueError(f"learning_rate must be a number from 0 to {FASTEST}, or a schedule, not {rate!r}.")
+    if isinstance(train_freq, tuple) and len(train_freq) != 2:
+        raise ValueError(f"train_freq must be a number of steps, or such as (1, 'episode'), not {train_freq!r}.")
     frequency = train_freq[0] if isinstance(train_freq, tuple) else train_freq
     if isinstance(frequency, int) and (isinstance(frequency, bool) or not 1 <= frequency <= LONGEST_ROLLOUT):
         raise ValueError(f"train_freq must be from 1 to {LONGEST_ROLLOUT}, not {train_freq!r}.")
+    for name in ("option_kwargs", "policy_kwargs"):
+        if arguments[name] is not None and not isinstance(arguments[name], dict):
+            raise ValueError(f"{name} must be a dictionary of keyword arguments, not {arguments[name]!r}.")
     for name in ("seed", "verbose"):
         value = arguments[name]
         if value is not None and (isinstance(value, bool) or not isinstance(value, int | np.integer)):
             raise ValueError(f"{name} must be a whole number, not {value!r}.")
     if arguments["skills"] not in SKILLS:
         raise ValueError(f"skills must be one of {', '.join(map(repr, SKILLS))}, not {arguments['skills']!r}.")
+
+
+def check_attributes(agent: OffPolicyAlgorithm) -> None:
+    """Refuse what SB3 cannot use, in attributes that may have been set after construction.
+
+    :param agent: the agent
+    :raises ValueError: naming the attribute and what it may be
+    """
+    noise, train_freq = agent.action_noise, agent.train_freq
+    if noise is not None and not isinstance(noise, ActionNoise):
+        raise ValueError(
+            f"agent.action_noise must be SB3's action noise or None, not {noise!r}: a number is for the constructor."
+        )
+    if not isinstance(train_freq, TrainFreq):
+        raise ValueError(
+            f"agent.train_freq must be SB3's, such as TrainFreq(4, TrainFrequencyUnit.STEP), not {train_freq!r}: a number is "
+            "for the constructor."
+        )
 
 
 def box(space: spaces.Space) -> spaces.Box:
@@ -146,6 +170,8 @@ def option_kwargs(agent: OffPolicyAlgorithm, arguments: dict[str, Any]) -> dict[
     if issubclass(cls, OptionLearner):
         kwargs.update(actor_learning_rate=agent.learning_rate, critic_learning_rate=agent.learning_rate)
         kwargs.update(saturation_penalty=SATURATION_PENALTY)
+        if "learning_rate" in (arguments["option_kwargs"] or {}):
+            raise ValueError(f"option_kwargs: {cls.__name__} takes actor_learning_rate and critic_learning_rate.")
     else:
         kwargs.update(learning_rate=agent.learning_rate)
     return {**kwargs, **(arguments["option_kwargs"] or {})}

@@ -182,6 +182,8 @@ def _train(args: argparse.Namespace) -> int:
 
 def _evaluate(args: argparse.Namespace) -> int:
     path, env_id, env_kwargs = find_run(args)
+    if args.out is not None and args.out.is_dir():
+        raise UserError(f"{args.out} is a folder: --out names a file for the pairs, such as {args.out / 'pairs.json'}.")
     env = make_env(env_id, env_kwargs)
     try:
         agent = load_agent(path, env)

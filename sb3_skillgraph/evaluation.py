@@ -228,8 +228,8 @@ def evaluate_pairs(
     >>> len(result.pairs), 0.0 <= result.success_rate <= 1.0
     (5, True)
     """
-    if n_pairs < 1:
-        raise ValueError(f"n_pairs must be 1 at least, not {n_pairs!r}.")
+    if not isinstance(n_pairs, int) or n_pairs < 1:
+        raise ValueError(f"n_pairs must be a whole number, 1 at least, not {n_pairs!r}.")
     if isinstance(env, str):
         find(env)
     made = make_recommended(env, env_kwargs or {}) if isinstance(env, str) else env

@@ -132,7 +132,7 @@ class Product(Metric):
     are far apart.
 
     :param parts: the parts
-    :raises ValueError: if there are none that can be measured, or two have a dimension in common
+    :raises ValueError: if they are none, none can be measured, or two have a dimension in common
 
     >>> metric = Product(Within([0, 1], 0.5), Angle([2], 0.2), Exact([3]))
     >>> round(float(metric.travel(np.array([0.0, 0.0, 3.1, 1.0]), np.array([0.0, 0.0, -3.1, 1.0]))), 2)
@@ -144,6 +144,8 @@ class Product(Metric):
     radius = 1.0
 
     def __init__(self, *parts: Part) -> None:
+        if not all(isinstance(part, Part) and part.dims for part in parts):
+            raise ValueError(f"event_radius is made of parts, such as Within([0, 1], 0.1), not of {list(parts)}.")
         dims = [i for part in parts for i in part.dims]
         if not any(isinstance(part, Within) for part in parts) or len(set(dims)) < len(dims) or min(dims) < 0:
             raise ValueError(f"event_radius needs parts with a radius, and each dimension at most once, not {list(parts)}.")
@@ -246,14 +248,17 @@ class Custom(Metric):
         return self._known_units[goal_dim]
 
     def check(self, goal_dim: int) -> None:
-        """Refuse a function that does not take many points at once."""
-        points = np.zeros((3, 2, goal_dim))
-        shape = np.shape(self.function(points, points[0]))
+        """Refuse a function that does not take many points at once, or whose distances are none."""
+        points = np.arange(6.0 * goal_dim).reshape(3, 2, goal_dim)
+        away = self.distance(points, points[0])
+        shape = away.shape
         if shape != (3, 2):
             raise ValueError(
                 f"event_radius={self!r} must return a distance for each of many points, shape (...) for points of shape "
                 f"(..., goal_dim); of shape (3, 2, {goal_dim}) it returned shape {shape}. With np.linalg.norm, give axis=-1."
             )
+        if not (np.isfinite(away) & (away >= 0.0)).all():
+            raise ValueError(f"event_radius={self!r} must return finite distances, 0 or more, and returned {away.tolist()}.")
 
     def get_state(self) -> Any:
         """Return the function."""

@@ -1,6 +1,7 @@
 """What a goal with several units is made of: places, angles, rotations, and what has to match."""
 
 import math
+import operator
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,12 +17,13 @@ class Part(ABC):
     """Some dimensions of a goal that are measured together.
 
     :param dims: which, counted from 0
+    :raises TypeError: if they are no whole numbers
     """
 
     dims: Sequence[int]
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "dims", tuple(int(i) for i in self.dims))
+        object.__setattr__(self, "dims", tuple(operator.index(i) for i in self.dims))
 
     @abstractmethod
     def embed(self, points: np.ndarray) -> np.ndarray:
@@ -181,8 +183,8 @@ def positive_radius(radius: Any) -> float:
 
     :raises ValueError: if it is no positive number
     """
-    if isinstance(radius, bool) or not isinstance(radius, int | float | np.number) or not 0 < radius <= HUGE:
-        raise ValueError(f"event_radius must be a positive number, or a metric, not {radius!r}.")
+    if isinstance(radius, bool) or not isinstance(radius, int | float | np.number) or not 1.0 / HUGE <= radius <= HUGE:
+        raise ValueError(f"event_radius must be a positive number up to {HUGE:g}, or a metric, not {radius!r}.")
     return float(radius)
 
 

@@ -15,7 +15,7 @@ import torch as th
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.noise import ActionNoise, VectorizedActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.utils import check_for_correct_spaces
+from stable_baselines3.common.utils import check_for_correct_spaces, get_device
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_skillgraph.goal_env import describe_space, make_space, refuse_changed_goals
@@ -171,7 +171,9 @@ def load(cls: Any, path: PathOrFile, env: Any, device: Any, given: dict[str, Any
     :param force_reset: whether ``learn`` is to begin at a fresh episode
     :raises ValueError: if the file is damaged, or does not fit
     :raises TypeError: if there is no such argument
+    :raises RuntimeError: if there is no such device
     """
+    get_device(device)  # one that there is not is no fault of the file
     tree = load_tree(path, "agent")
     check_header(tree, cls)
     unknown = set(given) - set(signature(cls.__init__).parameters)

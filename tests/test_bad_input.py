@@ -174,6 +174,10 @@ def test_refused_arguments(arguments: dict[str, Any]) -> None:
         dict(seed=True),
         dict(seed=1.5),
         dict(verbose=3.5),
+        dict(option_kwargs=5),
+        dict(option_kwargs=dict(learning_rate=1e-3)),
+        dict(policy_kwargs=5),
+        dict(train_freq=(2,)),
     ],
     ids=shown,
 )
@@ -192,6 +196,45 @@ def test_noise_may_be_any_number() -> None:
 def test_classes_for_other_actions_are_refused(option_class: Any) -> None:
     with pytest.raises(ValueError, match=f"option_class {option_class.__name__} cannot be built for continuous actions"):
         new_agent(option_class=option_class)
+
+
+@pytest.mark.parametrize(("name", "value"), [("action_noise", 0.3), ("train_freq", 4)])
+def test_attributes_that_sb3_cannot_use(tmp_path: Path, name: str, value: Any) -> None:
+    agent = new_agent().learn(60)
+    setattr(agent, name, value)
+    with pytest.raises(ValueError, match=f"agent.{name} must be SB3's"):
+        agent.learn(10, reset_num_timesteps=False)
+    with pytest.raises(ValueError, match=f"agent.{name} must be SB3's"):
+        agent.save(tmp_path / "agent")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_device_that_there_is_not_is_no_fault_of_the_file(trained_files: tuple[Path, Path]) -> None:
+    with pytest.raises(RuntimeError, match="gpuu"):
+        SkillGraphAgent.load(trained_files[0], device="gpuu")
+
+
+def test_states_that_are_none() -> None:
+    agent = new_agent()
+    observation, _ = gym.make(TOY).reset()
+    for state in (None, 5, (1, 2)):
+        with pytest.raises(ValueError, match="no state that predict has returned"):
+            agent.running(state)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="no state that predict has returned"):
+        agent.predict(observation, state=5)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="total_timesteps"):
+        agent.adapt(np.zeros(2), total_timesteps=0)
+
+
+def test_an_agent_that_is_not_set_up_says_so() -> None:
+    agent = SkillGraphAgent("MultiInputPolicy", gym.make(TOY), _init_setup_model=False)
+    assert repr(agent) == "<SkillGraphAgent after 0 steps: not set up>"
+
+
+@pytest.mark.parametrize("policy", [5, None, dict])
+def test_policies_that_are_none(policy: Any) -> None:
+    with pytest.raises(ValueError, match=r"Unknown policy .*'MultiInputPolicy'"):
+        SkillGraphAgent(policy, gym.make(TOY))
 
 
 def test_policy_of_another_kind() -> None:

@@ -222,7 +222,7 @@ def test_the_package_is_the_command_line() -> None:
     ("argv", "words"),
     [
         (["train", "SkillGraph/ToyMaz-v0"], "did you mean 'SkillGraph/ToyMaze-v0'"),
-        (["train", "ToyMaze-v0"], "did you mean"),
+        (["train", "ToyMaze-v0"], "did you mean 'SkillGraph/ToyMaze-v0'"),
         (["train", "no_such_package:Env-v0"], "no_such_package"),
         (["train", "CartPole-v1"], "goal environment"),
         (["train", TOY, "--hyperparams", "gama=0.9"], "did you mean 'gamma'"),
@@ -298,6 +298,16 @@ def test_a_run_knows_its_environment(folder: Path, tmp_path: Path, capsys: Captu
     assert warning in capsys.readouterr().out
     assert cli.main(["plot", str(folder), "--out", str(tmp_path)]) == 0
     assert {path.name for path in tmp_path.iterdir()} >= PICTURES
+
+
+def test_settings_of_a_run_are_looked_at_first(tmp_path: Path, capsys: Capture) -> None:
+    argv = ["train", TOY, "--steps", "20", "--out", str(tmp_path), "--hyperparams"]
+    assert cli.main([*argv, "event_radius=0.4"]) == 0
+    assert "holds a run with other settings" in error_line(capsys, [*argv, "event_radius=-1"])
+
+
+def test_pairs_go_to_a_file(folder: Path, tmp_path: Path, capsys: Capture) -> None:
+    assert f"{tmp_path} is a folder" in error_line(capsys, ["evaluate", str(folder), "--out", str(tmp_path)])
 
 
 def test_a_folder_without_an_agent(folder: Path, tmp_path: Path, capsys: Capture) -> None:

@@ -152,6 +152,11 @@ def test_parts_that_do_not_fit() -> None:
         Product(Within((0, 1), 0.5), Exact((1,)))
     with pytest.raises(ValueError, match="4 numbers"):
         Rotation((0, 1, 2), 0.1)
+    for parts in ((0.1,), ([Within((0,), 0.1)],), (Within((), 0.1),)):
+        with pytest.raises(ValueError, match="made of parts"):
+            Product(*parts)  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match="integer"):
+        Within((0.5,), 0.1)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="dimension 3"):
         MIXED.check(3)
 
@@ -259,8 +264,11 @@ def test_a_metric_of_ones_own_class_is_asked_for_again(metric: Metric) -> None:
         (lambda a, b: np.linalg.norm(a - b), r"shape \(3, 2, 2\) it returned shape \(\)"),
         ({"parts": [{"kind": "Withn", "dims": [0, 1], "radius": 0.3}]}, "not 'Withn'"),
         ({"parts": [{"kind": "Within", "dims": [0, 1]}]}, "Within cannot be made"),
+        (lambda a, b: np.nan * (a - b).sum(axis=-1), "finite distances, 0 or more"),
+        (lambda a, b: -np.linalg.norm(a - b, axis=-1), "finite distances, 0 or more"),
+        (1e-300, "positive number"),
     ],
-    ids=["few", "many", "one for all", "kind", "radius"],
+    ids=["few", "many", "one for all", "kind", "radius", "nan", "negative", "nothing"],
 )
 def test_what_is_no_metric_of_these_goals(radius: Any, message: str) -> None:
     with pytest.raises(ValueError, match=message):

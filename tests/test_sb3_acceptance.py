@@ -440,6 +440,9 @@ def test_what_is_learned_is_no_secret(trained: SkillGraphAgent) -> None:
         assert (source in ids) != (target in ids)
         assert all(value >= 0.0 for value in attributes.values())
     assert repr(trained) == f"<SkillGraphAgent after {trained.num_timesteps} steps: {trained.graph!r}>"
+    event, walk = trained.events[1], trained.options[1]
+    assert event.id in repr(event) and "within 0.45" in repr(event)
+    assert repr(walk) == f"<walk {walk.id} to {event.id}>"
 
 
 # -- habits -----------------------------------------------------------------------------------------------------------

@@ -232,6 +232,11 @@ class Car(gym.Env):
         return self._seen(), 0.0, crashed, False, {"crashed": crashed, "is_success": np.False_}
 
 
+def test_only_parking_is_parking() -> None:
+    with pytest.raises(ValueError, match="highway-env's parking-v0"):
+        Parking(gym.make(TOY))
+
+
 def test_a_crashed_car_is_stuck() -> None:
     env = Parking(Car())
     assert env.max_steps == 500  # 100 seconds

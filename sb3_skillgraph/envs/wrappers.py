@@ -212,6 +212,7 @@ class Parking(gym.Wrapper, gym.utils.RecordConstructorArgs):
     near enough to count here does there, too.
 
     :param env: ``parking-v0`` with its own weights
+    :raises ValueError: if it is another environment
     """
 
     goal_metric = Product(Within([0], 0.005), Within([1], 0.015), Direction([4, 5], 0.25))
@@ -219,6 +220,8 @@ class Parking(gym.Wrapper, gym.utils.RecordConstructorArgs):
     def __init__(self, env: gym.Env) -> None:
         gym.utils.RecordConstructorArgs.__init__(self)
         gym.Wrapper.__init__(self, env)
+        if not env.has_wrapper_attr("config") or "duration" not in env.get_wrapper_attr("config"):
+            raise ValueError(f"Parking is for highway-env's parking-v0, and this is {env}.")
 
     @property
     def max_steps(self) -> int:
@@ -277,15 +280,15 @@ class PursueGoals(gym.Wrapper, gym.utils.RecordConstructorArgs):
 
         :param seed: seed of the environment and of the goals
         :param options: ``"goal"``, shape ``(goal_dim,)``; what else there is goes to the wrapped environment
-        :raises ValueError: if a goal of another shape is given
+        :raises ValueError: if a goal is given that is no finite vector of its length
         """
         options = dict(options or {})
         given = options.pop("goal", None)
         observation, info = self.env.reset(seed=seed, options=options or None)
         drawn = self._drawn(self.np_random)
         self.goal = drawn if given is None else np.asarray(given, dtype=np.float64)
-        if self.goal.shape != drawn.shape:
-            raise ValueError(f"A goal has shape {drawn.shape}, and {given!r} has {self.goal.shape}.")
+        if self.goal.shape != drawn.shape or not np.isfinite(self.goal).all():
+            raise ValueError(f"A goal must be a finite vector of shape {drawn.shape}, not {given!r}.")
         shown = self._shown(observation)
         return shown, {**info, "is_success": self._is_reached(shown)}
 

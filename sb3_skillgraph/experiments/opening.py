@@ -73,8 +73,9 @@ def check_env_id(env_id: str) -> None:
         find(env_id)
     except (gym.error.Error, ImportError) as error:
         known = list(gym.registry)
-        short = {id.rpartition("/")[2]: id for id in known}
-        hint = did_you_mean(env_id, known) or did_you_mean(env_id.rpartition("/")[2], short)
+        # Who leaves out SkillGraph/ means one of ours
+        full = {id.rpartition("/")[2]: id for id in known if "/" in id}.get(env_id)
+        hint = f"; did you mean {full!r}" if full else did_you_mean(env_id, known)
         reason = f": {error}" if isinstance(error, ImportError) else ""
         raise UserError(f"there is no environment {env_id!r}{reason}{hint}.") from error
 
@@ -106,7 +107,7 @@ def find_run(args: argparse.Namespace) -> tuple[Path, str, dict[str, Any]]:
     else:
         env_id, env_kwargs = str(args.env), asked
     if config and (env_id, env_kwargs) != (config["env"], config["env_kwargs"]):
-        print(f"warning: the agent was trained in {config['env']} {config['env_kwargs'] or ''}")
+        print(f"warning: the agent was trained in {config['env']} {config['env_kwargs'] or ''}".rstrip())
     return path, env_id, env_kwargs
 
 

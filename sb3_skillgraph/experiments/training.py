@@ -81,6 +81,8 @@ def train(
     """
     config = dict(env=env_id, env_kwargs=env_kwargs, steps=steps, seed=seed, n_envs=n_envs, arguments=arguments)
     with for_people():
+        if (out / CONFIG).exists() and (checkpoints(out) or (out / AGENT).exists()):
+            _check_config(out, config)  # before what was given is looked at by itself
         env = make_vec_env(lambda: make_recommended(env_id, env_kwargs), n_envs)
     try:
         with for_people():  # who mistypes something leaves no folder

@@ -69,8 +69,8 @@ def rendered(env: gym.Env) -> np.ndarray:
         frame = env.render()
     except Exception as error:  # whatever a driver that is not there raises
         raise ValueError(
-            f"Nothing can be rendered here ({error}). Without a screen MuJoCo needs EGL (Debian's libegl1) or OSMesa "
-            "(libosmesa6), and MUJOCO_GL=egl or MUJOCO_GL=osmesa."
+            f"Nothing can be rendered here ({type(error).__name__}: {error}). If it is MuJoCo that renders: without a screen "
+            "it needs EGL (Debian's libegl1) or OSMesa (libosmesa6), and MUJOCO_GL=egl or MUJOCO_GL=osmesa."
         ) from error
     return np.asarray(Image.fromarray(np.asarray(frame, dtype=np.uint8)).resize((SIDE, SIDE)))
 

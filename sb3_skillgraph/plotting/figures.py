@@ -62,6 +62,9 @@ def draw_floor(axes: Axes, geometry: MazeGeometry | None, points: np.ndarray, ma
     note = "" if goal_dim <= 2 else f" (of {goal_dim} goal dimensions)"
     axes.set_xlabel("x" if geometry is not None else f"goal[0]{note}")
     axes.set_ylabel("y" if geometry is not None else f"goal[1]{note}")
+    if goal_dim == 1:  # drawn along a line
+        axes.set_ylabel("")
+        axes.set_yticks([])
 
 
 def way(geometry: MazeGeometry | None, begin: np.ndarray, end: np.ndarray) -> np.ndarray:
