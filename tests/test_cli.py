@@ -473,9 +473,14 @@ gym.register("Mine-v0", entry_point=Mine)
 def test_environments_of_other_packages_are_found(env_id: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "my_own_mazes.py").write_text(PACKAGE)
     monkeypatch.syspath_prepend(tmp_path)
-    steps = ["--steps", "150", "--hyperparams", "learning_starts=100"]
-    assert cli.main(["train", env_id, "--out", str(tmp_path / "run"), *steps]) == 0
-    assert {path.name for path in (tmp_path / "run").iterdir()} == {*TRAINED, "graph_150.json"}
+    out, settings = tmp_path / "run", ["--hyperparams", "learning_starts=100"]
+    assert cli.main(["train", env_id, "--out", str(out), "--steps", "150", *settings]) == 0
+    assert {path.name for path in out.iterdir()} == {*TRAINED, "graph_150.json"}
+    # All else, too: to train it further, to test it and to draw it
+    assert cli.main(["train", env_id, "--out", str(out), "--steps", "200", *settings]) == 0
+    assert cli.main(["evaluate", str(out), "--pairs", "2"]) == 0
+    assert cli.main(["plot", str(out), "--out", str(out)]) == 0
+    assert {*PICTURES, "graph_200.json"} <= {path.name for path in out.iterdir()}
 
 
 def test_a_package_that_is_not_there_is_named(capsys: Capture) -> None:
