@@ -298,7 +298,7 @@ def readme_table() -> str:
     for plan, shown in (
         ("point_mazes", ("medium", "hard")),
         ("kept", ("key-door",)),
-        ("foreign", ("fetch-reach", "panda-reach", "point-large", "ant-umaze-v5")),
+        ("foreign", ("fetch-reach", "panda-reach", "point-large", "ant-umaze-v5", "fetch-push", "parking")),
         ("ants", ("ant-umaze", "ant-medium", "ant-large")),
     ):
         rows = {(row["environment"], row["method"]): row for row in summary(plan)}

@@ -249,7 +249,7 @@ class Custom(Metric):
 
     def check(self, goal_dim: int) -> None:
         """Refuse a function that does not take many points at once, or whose distances are none."""
-        points = np.arange(6.0 * goal_dim).reshape(3, 2, goal_dim)
+        points = 1e-3 * (1.0 + np.arange(6.0 * goal_dim)).reshape(3, 2, goal_dim)  # small: as far as any function goes
         away = self.distance(points, points[0])
         shape = away.shape
         if shape != (3, 2):

@@ -320,11 +320,11 @@ def test_a_folder_without_an_agent(folder: Path, tmp_path: Path, capsys: Capture
 
 
 def test_numbers_may_be_written_as_people_do(tmp_path: Path) -> None:
-    given = ["event_radius=3e-1", "learning_rate=1e-4", "train_freq=[1, episode]", "batch_size=1e1"]
+    given = ["event_radius=3e-1", "learning_rate=1e-4", "train_freq=[1, episode]", "batch_size=1e1", "buffer_size=1.5e3"]
     argv = ["train", TOY, "--steps", "1e1", "--out", str(tmp_path), "--env-kwargs", "max_steps=2e1", "--hyperparams", *given]
     assert cli.main(argv) == 0
     agent = SkillGraphAgent.load(tmp_path / "agent.zip")
-    assert (agent.event_radius, agent.learning_rate, agent.batch_size) == (0.3, 1e-4, 10)
+    assert (agent.event_radius, agent.learning_rate, agent.batch_size, agent.buffer_size) == (0.3, 1e-4, 10, 1500)
     assert (agent.train_freq.frequency, agent.train_freq.unit.value) == (1, "episode")
     assert json.loads((tmp_path / "config.json").read_text())["env_kwargs"] == {"max_steps": 20}
 

@@ -275,6 +275,18 @@ def test_what_is_no_metric_of_these_goals(radius: Any, message: str) -> None:
         SkillGraphAgent("MultiInputPolicy", gym.make(TOY), event_radius=radius)
 
 
+def test_functions_that_ask_for_points_of_their_kind_are_metrics() -> None:
+    def turn(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        return 2.0 * np.arccos(np.abs((a * b).sum(axis=-1))) / 0.1  # of unit quaternions
+
+    def heading(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        a, b = a / np.linalg.norm(a, axis=-1, keepdims=True), b / np.linalg.norm(b, axis=-1, keepdims=True)
+        return np.linalg.norm(a - b, axis=-1) / 0.2
+
+    for function, goal_dim in ((turn, 4), (heading, 2)):
+        as_metric(function).check(goal_dim)
+
+
 def test_networks_see_goals_of_a_users_own_metric_in_its_units() -> None:
     metric = as_metric(lambda a, b: np.abs(a - b) @ np.array([1 / 0.0144, 1 / 40.0, 0.0]))
     units = metric.reach(3)

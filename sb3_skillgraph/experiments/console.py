@@ -66,7 +66,7 @@ def numbers(value: Any) -> Any:
         return [numbers(item) for item in value]
     if isinstance(value, dict):
         return {name: numbers(item) for name, item in value.items()}
-    if not (isinstance(value, str) and re.fullmatch(r"[-+]?[0-9][0-9_]*e[-+]?[0-9]+", value, re.IGNORECASE)):
+    if not (isinstance(value, str) and re.fullmatch(r"[-+]?[0-9][0-9_]*(\.[0-9]*)?e[-+]?[0-9]+", value, re.IGNORECASE)):
         return value
     number = float(value)
     return int(number) if number.is_integer() else number
