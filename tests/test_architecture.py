@@ -46,7 +46,7 @@ FLOORS: dict[str, float] = {
     "smdp": 11,  # on options, not on the agent
     "callbacks": 12,
     "hyperparams": 12,
-    "evaluation": 12,
+    "evaluation": 12.5,  # in what is recommended for an environment
     "baselines": 13,
     "plotting": 13,
     "experiments": 14,
