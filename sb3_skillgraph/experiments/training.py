@@ -81,7 +81,7 @@ def train(
     """
     config = dict(env=env_id, env_kwargs=env_kwargs, steps=steps, seed=seed, n_envs=n_envs, arguments=arguments)
     with for_people():
-        if (out / CONFIG).exists() and (checkpoints(out) or (out / AGENT).exists()):
+        if _holds_a_run(out):
             _check_config(out, config)  # before what was given is looked at by itself
         env = make_vec_env(lambda: make_recommended(env_id, env_kwargs), n_envs)
     try:
@@ -118,14 +118,17 @@ def _claimed(out: Path) -> Iterator[None]:
         raise UserError(f"another command is at work in {out}.") from error
 
 
+def _holds_a_run(out: Path) -> bool:
+    """Tell whether there is a run in a folder of which something came."""
+    return (out / CONFIG).exists() and (bool(checkpoints(out)) or (out / AGENT).exists())
+
+
 def _check_folder(out: Path, config: dict[str, Any]) -> None:
     """Refuse a folder that holds something else; let what is finished go on."""
-    if not (out / CONFIG).exists():
-        if (out / AGENT).exists():
-            raise UserError(f"{out} holds an agent already; give another folder with --out, or remove it.")
+    if not (out / CONFIG).exists() and (out / AGENT).exists():
+        raise UserError(f"{out} holds an agent already; give another folder with --out, or remove it.")
+    if not _holds_a_run(out):
         return
-    if not checkpoints(out) and not (out / AGENT).exists():
-        return  # nothing came of it
     done = _check_config(out, config)
     if not (out / DONE).exists() or not (out / AGENT).exists():
         return
