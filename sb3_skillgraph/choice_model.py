@@ -150,11 +150,21 @@ class ChoiceModel:
             return guessed if everywhere else self._short(guessed, least=1)
         beside = self._beside(self._edges(graph.edges.target == home, replaced, tried), home, goal, runs)
         near = near[~np.isin(near, beside.source)]
-        seen = (near == home).astype(np.float64)  # somebody was near the goal, in its event
+        seen = self._seen(near, home)
         guessed = self._guessed(near, near, vertex, graph.centers[near], goal, seen, runs)
         if not everywhere:
             guessed = self._short(guessed, least=0 if len(beside.source) else 1)
         return Choices.join([guessed, beside])
+
+    def _seen(self, events: np.ndarray, home: int) -> np.ndarray:
+        """Return 1 where somebody went to a goal's event, 0 elsewhere.
+
+        :param events: from which events, shape ``(n,)``
+        :param home: the goal's event, ``NOWHERE`` if it lies in none
+        """
+        # Who was in the goal's event was near the goal; and that there is no edge tells nothing where it was let go
+        let_go = [(event, home) in self.graph.edges.let_go for event in events.tolist()]
+        return ((events != NOWHERE) & ((events == home) | let_go)).astype(np.float64)
 
     def _short(self, guessed: Choices, least: int) -> Choices:
         """Return the guessed walks that are no longer than those of the graph.
@@ -251,7 +261,8 @@ class ChoiceModel:
         # There always is a way: at worst the walk straight to the goal
         targets = np.concatenate([part.target for part in parts])
         if n_events not in targets:
-            direct = self._guessed(here, event, n_events, start.point, goal[None], np.zeros(1), runs)
+            seen = self._seen(event, graph.locate(goal))
+            direct = self._guessed(here, event, n_events, start.point, goal[None], seen, runs)
             # One that would be longer than any walk in the graph is begun only where there is nothing else to do.
             if direct.steps[0] <= graph.walk_steps or not len(targets) or start.towards == n_events:
                 parts.append(direct)

@@ -29,6 +29,7 @@ class Edges:
             **{name: np.zeros(64) for name in _NUMBERS},
         }
         self._rows: dict[tuple[int, int], int] = {}
+        self.let_go: set[tuple[int, int]] = set()  # pairs that a trajectory went between, of which a row was not kept
 
     @property
     def source(self) -> np.ndarray:
@@ -117,19 +118,25 @@ class Edges:
         return row
 
     def keep(self, rows: np.ndarray) -> None:
-        """Let go of all other rows.
+        """Let go of all other rows; that somebody went there is still known.
 
         :param rows: row numbers, ascending
         """
+        gone = np.setdiff1d(np.flatnonzero(self.forward > 0), rows)
+        self.let_go.update(zip(self.source[gone].tolist(), self.target[gone].tolist(), strict=True))
         for array in self._arrays.values():
             array[: len(rows)] = array[rows]
         self.size = len(rows)
+        self._rows = self._by_pair()
+
+    def _by_pair(self) -> dict[tuple[int, int], int]:
         pairs = zip(self.source.tolist(), self.target.tolist(), strict=True)
-        self._rows = {pair: row for row, pair in enumerate(pairs)}
+        return {pair: row for row, pair in enumerate(pairs)}
 
     def get_state(self) -> dict[str, np.ndarray]:
-        """Return all columns."""
-        return {name: array[: self.size].copy() for name, array in self._arrays.items()}
+        """Return all columns, and the pairs that were let go."""
+        let_go = np.array(sorted(self.let_go), dtype=np.int64).reshape(-1, 2)
+        return {**{name: array[: self.size].copy() for name, array in self._arrays.items()}, "let_go": let_go}
 
     def set_state(self, state: dict[str, np.ndarray]) -> None:
         """Restore what :meth:`get_state` returned."""
@@ -137,7 +144,8 @@ class Edges:
         self._arrays = {name: np.array(state[name]) for name in self._arrays}
         if self.size == 0:
             self._arrays = Edges()._arrays
-        self.keep(np.arange(self.size))
+        self._rows = self._by_pair()
+        self.let_go = {(source, target) for source, target in state["let_go"].tolist()}
 
 
 def land(landings: np.ndarray, weights: np.ndarray, landing: int, weight: float) -> None:

@@ -159,6 +159,7 @@ class SkillGraph:
             source, target = int(new_index[old_edges.source[row]]), int(new_index[old_edges.target[row]])
             if source != target:
                 self._pour(old_edges, row, source, target, new_index)
+        self.edges.let_go = {(int(new_index[source]), int(new_index[target])) for source, target in old_edges.let_go}
         self.version += 1
 
     def _build_index(self) -> dict[str, int]:

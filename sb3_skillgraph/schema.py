@@ -172,6 +172,7 @@ def _graph(n_events: int, goal_dim: int) -> Check:
             landing_weight=array((None, MAX_LANDINGS), low=0.0),
             **dict.fromkeys(("forward", "backward", "crossing_steps", "successes", "success_steps"), weights),
             **dict.fromkeys(("failures", "failure_steps", "updated"), weights),
+            let_go=array((None, 2), "i", 0, n_events - 1),
         ),
         visits=array((n_events,), low=0.0),
         barren=array((n_events,), low=0.0),
@@ -187,7 +188,7 @@ def _check_edges(graph: dict[str, Any], n_events: int) -> None:
     if len({*ids, *graph["walks"]}) < 2 * n_events or any(not id for id in (*ids, *graph["walks"])):
         refuse("graph", "one of events and walks with different ids", ids)
     edges = graph["edges"]
-    lengths = {len(column) for column in edges.values()}
+    lengths = {len(column) for name, column in edges.items() if name != "let_go"}
     pairs = {*zip(edges["source"].tolist(), edges["target"].tolist(), strict=False)}
     if len(lengths) > 1 or len(pairs) < max(lengths) or any(source == target for source, target in pairs):
         refuse("graph/edges", "columns of one length, a row for each pair of events", sorted(lengths))

@@ -261,9 +261,34 @@ def test_events_let_go_of_the_edges_worth_least_only() -> None:
     for i in range(7, 12):
         assert record(graph, 0, i)["success_steps"] == record(graph, 0, i)["crossing_steps"] == i
     assert [graph.edges.find(0, i) for i in range(1, 7)] == [None] * 6
+    assert graph.edges.let_go == {(0, i) for i in range(1, 7)}  # that somebody went there is still known
     for i in range(1, 12):  # the others have one edge each
         row = graph.edges.find(i, 0)
         assert (graph.edges.source[row], graph.edges.target[row], graph.edges.backward[row]) == (i, 0, 1.0)
+
+
+def test_a_guess_that_is_let_go_of_was_no_more_than_a_guess() -> None:
+    graph = line(9)
+    for i in range(1, 9):
+        graph.crossed(i, 0, i)  # back, from 0 to all of them, it is a guess
+    with mock.patch.object(graph_module, "MAX_DEGREE", 3):
+        graph.bound_degree(np.ones(graph.edges.size))
+    assert np.bincount(graph.edges.source)[0] == 3
+    assert not graph.edges.let_go
+
+
+def test_where_somebody_went_is_known_of_merged_events_and_of_restored_graphs_too() -> None:
+    graph = line(8, spacing=1.6, salient=(0, 3, 7))
+    for i in range(1, 8):
+        graph.crossed(0, i, i)
+    with mock.patch.object(graph_module, "MAX_DEGREE", 1):
+        graph.bound_degree(graph.edges.target.astype(float))
+    restored = SkillGraph(2, 1.0, 100)
+    restored.set_state(copy.deepcopy(graph.get_state()))
+    assert restored.edges.let_go == graph.edges.let_go == {(0, i) for i in range(1, 7)}
+    new_index = graph.coarsen()
+    assert [event.id for event in graph.events] == ["e0", "e3", "e5", "e7"]
+    assert graph.edges.let_go >= {(0, int(new_index[i])) for i in (2, 3, 5)}
 
 
 def test_of_edges_that_are_worth_the_same_the_oldest_stay() -> None:
@@ -393,6 +418,7 @@ def check(graph: SkillGraph) -> None:
         assert source != target
         assert 0 <= source < n
         assert 0 <= target < n
+    assert all(0 <= end < n for pair in edges.let_go for end in pair)
     assert (edges.forward + edges.backward > 0).all()
     assert (edges.crossing_steps >= 1).all()
     for column in (edges.successes, edges.success_steps, edges.failures, edges.landing_weight):

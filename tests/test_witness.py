@@ -371,6 +371,21 @@ def test_walks_to_goals_teach_of_ways_that_nobody_went() -> None:
     assert rates[False] < FIRST_GUESS - 0.1 < FIRST_GUESS + 0.3 < rates[True]
 
 
+@pytest.mark.parametrize("aim", [(0.8, 0.0), (4.0, 0.0)])  # in the event where they began, and where an edge was let go
+def test_walks_to_goals_teach_of_ways_that_somebody_went(aim: tuple[float, float]) -> None:
+    witness = make_witness()
+    walk(witness, [*straight(6.0), 8.0])
+    graph = witness.graph
+    graph.edges.keep(np.flatnonzero(graph.edges.target != graph.locate(np.array(aim))))
+    for _ in range(40):
+        witness.began(0, np.zeros(2))
+        witness.ended(run("e0", "direct", False, landing="", steps=12, aim=aim))
+    witness.fit()
+    samples = witness.get_state()["samples"]
+    assert samples[:, 1].tolist() == [1.0] * 40
+    assert witness.choice_model.model.success(witness.choice_model.kinds()).max() < FIRST_GUESS - 0.1
+
+
 def test_the_model_is_fitted_every_so_many_steps() -> None:
     witness = make_witness()
     walk(witness, [*straight(6.0), 8.0])

@@ -20,8 +20,8 @@ FIT_EVERY = 1_000
 N_SAMPLES = 1_000
 #: Failures that nothing is known of, in the share that land far away: few say little.
 FAR_PRIOR = 2.0
-#: Columns of the samples: distance (event radii), whether the goal's event was where it began, success, steps; then what
-#: has to match and did not where it began.
+#: Columns of the samples: distance (event radii), whether the goal's event was where it began or somebody went there from that
+#: event, success, steps; then what has to match and did not where it began.
 _COLUMNS = 4
 
 
@@ -201,9 +201,10 @@ class Witness:
         if run.option == DIRECT:
             ends = run.aim, self._began[run.env]
             distance, changes = float(graph.metric.travel(*ends)), graph.metric.mismatches(*ends)
-            at_home = source != NOWHERE and graph.locate(run.aim) == source
+            home = graph.locate(run.aim)
+            seen = source != NOWHERE and (home == source or (source, home) in graph.edges.let_go)
             row = self._n_samples % N_SAMPLES
-            self._samples[row] = distance, at_home, run.success, run.steps, *changes
+            self._samples[row] = distance, seen, run.success, run.steps, *changes
             self._n_samples += 1
 
     def fit(self) -> None:
@@ -212,9 +213,9 @@ class Witness:
         aging = graph.aging()
         # Runs of walks to events are in the graph; those to goals, which no edge keeps, are kept here
         samples = self._samples[: min(self._n_samples, N_SAMPLES)]
-        distance, at_home, success, steps = samples[:, :_COLUMNS].T
+        distance, seen, success, steps = samples[:, :_COLUMNS].T
         kinds = self.choice_model.kinds()
-        known = at_home * distance * model.steps_per_radius, at_home, np.zeros(len(samples))
+        known = seen * distance * model.steps_per_radius, seen, np.zeros(len(samples))
         direct = Kind(distance, *known, samples[:, _COLUMNS:] > 0.0)
         # What ran long ago, as the walker's training goes, counts less
         model.fit(
