@@ -108,6 +108,28 @@ def list_of(check: Check, length: int | None = None, kind: type[list[Any] | tupl
     return check_all
 
 
+def some(check: Check) -> Check:
+    """Check a list that is not empty."""
+
+    def check_some(value: Any, where: str) -> None:
+        check(value, where)
+        if not value:
+            refuse(where, "a list that is not empty", value)
+
+    return check_some
+
+
+def at_most(n: int, check: Check) -> Check:
+    """Check what may have so many rows."""
+
+    def check_length(value: Any, where: str) -> None:
+        check(value, where)
+        if len(value) > n:
+            refuse(where, f"of {n} rows at most", value)
+
+    return check_length
+
+
 def each(*checks: Check, kind: type[list[Any] | tuple[Any, ...]] = list) -> Check:
     """Check a list, or a tuple, whose items are of different kinds."""
 

@@ -4,6 +4,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sb3_skillgraph.digraph import as_digraph
 from sb3_skillgraph.edges import NOWHERE, RECORD, Edges, land
 from sb3_skillgraph.events import Event
 from sb3_skillgraph.metric import MISMATCH, Metric, as_metric
@@ -19,11 +20,10 @@ MAX_DEGREE = 32
 AGING = 1.0
 #: Updates of the walker before which runs do not age: all of its training so far would be "half of it ago".
 YOUNG = 500.0
+#: Trajectories that the mean of their steps is taken over: it follows a walker that gets faster.
+RECENT = 10.0
 #: By how much the cover's radius grows when there are too many events.
 GROWTH = 1.25
-
-#: What the picture of an edge shows of its record.
-_SHOWN = ("forward", "backward", "crossing_steps", *RECORD)
 
 
 class SkillGraph:
@@ -196,8 +196,8 @@ class SkillGraph:
         if edges.forward[there] == 0:
             edges.crossing_steps[there] = steps
         edges.forward[there] += 1
-        # A running mean that follows the walker as it learns.
-        edges.crossing_steps[there] += (steps - edges.crossing_steps[there]) / min(edges.forward[there], 10.0)
+        # A running mean that follows the walker as it learns
+        edges.crossing_steps[there] += (steps - edges.crossing_steps[there]) / min(edges.forward[there], RECENT)
         if edges.forward[back] == 0:
             edges.crossing_steps[back] = edges.crossing_steps[there]
         edges.backward[back] += 1
@@ -271,8 +271,7 @@ class SkillGraph:
     def nx(self) -> "networkx.DiGraph":
         """The graph as networkx has it, numbers and strings only: a copy to look at, made when asked for.
 
-        Edges from an event to a walk carry the record of the walk's runs from there; edges from a walk to an event the
-        share of its runs that landed there, wherever they began.
+        See :func:`~sb3_skillgraph.digraph.as_digraph`.
 
         >>> graph = SkillGraph(goal_dim=2, metric=0.5, max_events=100)
         >>> home, door = (graph.add_event(np.array(center), salient=False) for center in ([0.0, 0.0], [1.0, 0.0]))
@@ -281,32 +280,8 @@ class SkillGraph:
         [('e0', 'w1'), ('w1', 'e1')]
         """
         if self._nx is None or self._nx[0] != self.version:
-            self._nx = (self.version, self._build_nx())
+            self._nx = (self.version, as_digraph(self.events, self.walk_ids, self.edges))
         return self._nx[1]
-
-    def _build_nx(self) -> "networkx.DiGraph":
-        import networkx  # when it is used: it takes a while to import
-
-        graph, edges = networkx.DiGraph(), self.edges
-        for i, event in enumerate(self.events):
-            graph.add_node(event.id, **event.as_vertex())
-            graph.add_node(self.walk_ids[i], kind="walk", target=event.id)
-        columns = {name: getattr(edges, name).tolist() for name in _SHOWN}
-        landed: dict[tuple[str, str], float] = {}
-        for row, (source, target) in enumerate(zip(edges.source.tolist(), edges.target.tolist(), strict=True)):
-            walk = self.walk_ids[target]
-            graph.add_edge(self.events[source].id, walk, **{name: values[row] for name, values in columns.items()})
-            ends = [(target, columns["successes"][row])]
-            ends += zip(edges.landing[row].tolist(), edges.landing_weight[row].tolist(), strict=True)
-            for end, weight in ends:
-                if weight > 0.0 and end != NOWHERE:
-                    key = walk, self.events[end].id
-                    landed[key] = landed.get(key, 0.0) + weight
-        runs = np.zeros(len(self.events))
-        np.add.at(runs, edges.target, edges.successes + edges.failures)
-        for (walk, end), weight in landed.items():
-            graph.add_edge(walk, end, rate=weight / runs[self.index(graph.nodes[walk]["target"])])
-        return graph
 
     def summary(self) -> dict[str, float]:
         """Describe the graph in numbers.

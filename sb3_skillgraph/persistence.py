@@ -1,7 +1,6 @@
 """An agent to and from plain data: nothing is ever unpickled."""
 
 import io
-import random
 import warnings
 from collections import deque
 from collections.abc import Callable, Iterable
@@ -11,13 +10,13 @@ from inspect import signature
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch as th
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.noise import ActionNoise, VectorizedActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.utils import check_for_correct_spaces, get_device
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_skillgraph import generators
 from sb3_skillgraph.goal_env import describe_space, make_space, refuse_changed_goals
 from sb3_skillgraph.learning.scale import LOOK_AT
 from sb3_skillgraph.metric import Metric, as_saved
@@ -97,7 +96,7 @@ def _progress(agent: Any) -> dict[str, Any]:
         "rollout": rollout.get_state(),
         "salience": _told("The salience", salience.get_state) if hasattr(salience, "get_state") else None,
         "rng": agent.parts.rng.bit_generator.state if pending is None else pending.rng_state,
-        "global_generators": _generators() if agent._loaded is None else agent._loaded.generators,
+        "global_generators": generators.get_states() if agent._loaded is None else agent._loaded.generators,
         "environments": _snapshot(agent),
     }
 
@@ -106,22 +105,6 @@ def _measured(info: dict[str, Any]) -> list[dict[str, float]]:
     """Return what SB3 logs of an episode; nothing if its reward is no number, which means nothing here anyway."""
     measured = {name: float(info[name]) for name in ("r", "l", "t")}
     return [measured] if np.isfinite(list(measured.values())).all() else []
-
-
-def _generators() -> dict[str, Any]:
-    """Return the states of the generators of the process, from which SB3's noise and networks draw."""
-    return {
-        "python": list(random.getstate()),
-        "numpy": np.random.get_state(legacy=False),  # noqa: NPY002
-        "torch": th.get_rng_state(),
-    }
-
-
-def _set_generators(state: dict[str, Any]) -> None:
-    """Set the generators of the process."""
-    random.setstate(tuple(state["python"]))
-    np.random.set_state(state["numpy"])  # noqa: NPY002
-    th.set_rng_state(state["torch"])
 
 
 def _told(who: str, get_state: Callable[[], Any]) -> Any:
@@ -248,11 +231,11 @@ def _restore(agent: Any, tree: dict[str, Any], same_envs: bool) -> None:
         parts.rollout.scale = None  # it has told what it saw
     if same_envs:
         agent._env_snapshot = progress["environments"]
-    before = _generators()
+    before = generators.get_states()
     try:
-        _set_generators(progress["global_generators"])  # or they are none
+        generators.set_states(progress["global_generators"])  # or they are none
     finally:
-        _set_generators(before)
+        generators.set_states(before)
 
 
 def restore_env(agent: Any) -> bool:
@@ -273,7 +256,7 @@ def restore_env(agent: Any) -> bool:
             )
         if agent.verbose and snapshot is None:
             print("The environments' states are not known (no get_state/set_state): learning resumes at a fresh episode.")
-        _set_generators(loaded.generators)
+        generators.set_states(loaded.generators)
     if snapshot is None or agent.env is None or not agent.env.has_attr("set_state"):
         return False
     agent.env.reset()

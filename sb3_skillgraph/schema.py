@@ -17,6 +17,7 @@ from sb3_skillgraph.checking import (
     Check,
     anything,
     array,
+    at_most,
     dict_of,
     each,
     entries,
@@ -27,6 +28,7 @@ from sb3_skillgraph.checking import (
     optimizer_state,
     optional,
     refuse,
+    some,
     state_dict,
     text,
     whole,
@@ -244,7 +246,7 @@ def _rollout(n_envs: int, spec: Any, n_events: int, n_matched: int) -> Check:
         clean=flag,
     )
     event, passed = whole(0, max(n_events - 1, 0)), each(whole(), number(0.0), kind=tuple)
-    stay = each(event, whole(), whole(), number(0.0), _some(list_of(passed)))
+    stay = each(event, whole(), whole(), number(0.0), some(list_of(passed)))
     return entries(
         runner=each(*(_like(name, column) for name, column in zip(fresh._fields, fresh, strict=True)), kind=tuple),
         held=array((n_envs, spec.action_dim), low=-1.0, high=1.0),
@@ -254,14 +256,14 @@ def _rollout(n_envs: int, spec: Any, n_events: int, n_matched: int) -> Check:
         n_steps=whole(),
         missions=entries(current=list_of(optional(mission), n_envs), pinned=optional(goal)),
         witness=entries(
-            samples=_at_most(N_SAMPLES, array((None, 4 + n_matched), low=0.0)),
+            samples=at_most(N_SAMPLES, array((None, 4 + n_matched), low=0.0)),
             n_samples=whole(),
             n_steps=whole(),
             stays=list_of(list_of(stay), n_envs),
             step=list_of(whole(), n_envs),
             began=array((n_envs, spec.goal_dim)),
             growth=entries(
-                runs=dict_of(_at_most(GESTATION, list_of(flag))),
+                runs=dict_of(at_most(GESTATION, list_of(flag))),
                 suspects=list_of(text),
                 before=dict_of(whole(0, ENOUGH_RUNS)),
                 again=dict_of(number(0.0)),
@@ -289,24 +291,6 @@ def _mt19937(value: Any, where: str) -> None:
 def _like(name: str, column: np.ndarray) -> Check:
     """Check an array of a runner's state, which has the shape and kind of another one; what counts is not negative."""
     return array(column.shape, column.dtype.kind, -HUGE if name in ("aim", "seen") else 0.0)
-
-
-def _some(check: Check) -> Check:
-    def check_some(value: Any, where: str) -> None:
-        check(value, where)
-        if not value:
-            refuse(where, "a list that is not empty", value)
-
-    return check_some
-
-
-def _at_most(n: int, check: Check) -> Check:
-    def check_length(value: Any, where: str) -> None:
-        check(value, where)
-        if len(value) > n:
-            refuse(where, f"of {n} rows at most", value)
-
-    return check_length
 
 
 def _state_of(env: VecEnv) -> Any:

@@ -17,6 +17,7 @@ FLOORS: dict[str, float] = {
     "interrupts": 0,
     "rules": 0,  # numbers
     "vec_env": 0,
+    "generators": 0,
     "metric_parts": 0.05,
     "metric": 0.1,  # knows how large numbers may be
     "events": 0.5,
@@ -29,6 +30,7 @@ FLOORS: dict[str, float] = {
     "options": 3,  # initiation sets, policies, termination sets
     "goal_env": 3.5,  # what an environment tells, its view of options among it
     "edges": 3,  # records of runs, as arrays
+    "digraph": 3.5,  # a picture of them
     "graph": 4,
     "walk_model": 5,
     "choices": 5,
