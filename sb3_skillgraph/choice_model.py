@@ -30,6 +30,8 @@ class ChoiceModel:
         self.graph = graph
         self.model = model
         self._walks: tuple[tuple[int, int], Choices] | None = None
+        #: Of all walks but hasty ones, by the events that they begin in and by those that they lead to: successes and runs.
+        self._kin: list[tuple[np.ndarray, np.ndarray]] = []
 
     @property
     def version(self) -> tuple[int, int]:
@@ -57,6 +59,7 @@ class ChoiceModel:
         successes, failures = edges.successes * aging, edges.failures * aging
         hasty = self.model.is_hasty(kinds)
         guess = self._with_kin(self.model.success(kinds), hasty, successes, successes + failures)
+        self._kin = self._by_end(0, ~hasty * successes, ~hasty * (successes + failures))
         # A guess of the steps counts for one run.
         steps = (self.model.steps(kinds) + edges.success_steps * aging) / (1.0 + successes)
         failed_steps = (self.model.patience * timeout(steps) + edges.failure_steps * aging) / (1.0 + failures)
@@ -77,16 +80,23 @@ class ChoiceModel:
         :param hits: weight of the runs of each edge of which the share is guessed
         :param runs: weight of all of its runs
         """
-        edges, n_events = self.graph.edges, len(self.graph.events)
-        # The guess counts for as many runs as it does everywhere, kin for a share of theirs, no run for itself
-        total, weight = GUESS_RUNS * guess, np.full(len(guess), GUESS_RUNS)
-        for ends in (edges.source + n_events * hasty, edges.target + n_events * hasty):
-            kin_hits = np.bincount(ends, hits, 2 * n_events)[ends] - hits
-            kin_runs = np.bincount(ends, runs, 2 * n_events)[ends] - runs
-            scale = np.minimum(KINSHIP, MOST_KINSHIP / np.maximum(kin_runs, 1e-9))
-            total += scale * kin_hits
-            weight += scale * kin_runs
-        return np.clip(total / weight, 0.0, 1.0)
+        # Hasty ones have events of their own, after the others
+        apart = len(self.graph.events) * hasty
+        ends = self.graph.edges.source + apart, self.graph.edges.target + apart
+        by_end = zip(ends, self._by_end(apart, hits, runs), strict=True)
+        kin = [(all_hits[at] - hits, all_runs[at] - runs) for at, (all_hits, all_runs) in by_end]  # no run for itself
+        return corrected(guess, kin)
+
+    def _by_end(self, apart: np.ndarray | int, hits: np.ndarray, runs: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Return the weights of runs of edges, summed by the events that they begin in, and by those that they lead to.
+
+        :param apart: what to add to the indices of the events of each edge
+        :param hits: weight of some of the runs of each edge, shape ``(n_edges,)``
+        :param runs: weight of all of its runs
+        """
+        edges, n = self.graph.edges, 2 * len(self.graph.events)
+        ends = edges.source + apart, edges.target + apart
+        return [(np.bincount(events, hits, n), np.bincount(events, runs, n)) for events in ends]
 
     def far_failures(self, kinds: Kind) -> np.ndarray:
         """Return the weight of the failed runs of each edge that landed far away or nowhere, shape ``(n_edges,)``.
@@ -140,31 +150,43 @@ class ChoiceModel:
         the events nearest to the goal if they have no such walk, it is a guess; a walk that would be longer than any in the
         graph is considered only where there is no shorter one.
         """
-        graph, vertex = self.graph, len(self.graph.events)
+        graph, known = self.graph, []
         home = graph.locate(goal)
         near = np.argsort(graph.distances(goal), kind="stable")
         if not everywhere:
             near = near[:NEAR_EVENTS]
-        if home == NOWHERE:
-            guessed = self._guessed(near, near, vertex, graph.centers[near], goal, np.zeros(len(near)), runs)
-            return guessed if everywhere else self._short(guessed, least=1)
-        beside = self._beside(self._edges(graph.edges.target == home, replaced, tried), home, goal, runs)
-        near = near[~np.isin(near, beside.source)]
-        seen = self._seen(near, home)
-        guessed = self._guessed(near, near, vertex, graph.centers[near], goal, seen, runs)
+        if home != NOWHERE:
+            known = [self._beside(self._edges(graph.edges.target == home, replaced, tried), home, goal, runs)]
+            near = near[~np.isin(near, known[0].source)]
+        guessed = self._straight_on(near, near, graph.centers[near], goal, home, runs)
         if not everywhere:
-            guessed = self._short(guessed, least=0 if len(beside.source) else 1)
-        return Choices.join([guessed, beside])
+            guessed = self._short(guessed, least=0 if any(len(walks.source) for walks in known) else 1)
+        return Choices.join([guessed, *known])
 
-    def _seen(self, events: np.ndarray, home: int) -> np.ndarray:
-        """Return 1 where somebody went to a goal's event, 0 elsewhere.
+    def _straight_on(
+        self, source: np.ndarray, event: np.ndarray, begin: np.ndarray, goal: np.ndarray, home: int, runs: Runs
+    ) -> Choices:
+        """Return walks straight to a goal that no edge stands for.
 
-        :param events: from which events, shape ``(n,)``
+        :param source: vertices where they begin, shape ``(n,)``
+        :param event: events that these belong to, ``NOWHERE`` if to none
+        :param begin: where that is, shape ``(n, goal_dim)``
+        :param goal: shape ``(goal_dim,)``
         :param home: the goal's event, ``NOWHERE`` if it lies in none
+        :param runs: of the episode
         """
         # Who was in the goal's event was near the goal; and that there is no edge tells nothing where it was let go
-        let_go = [(event, home) in self.graph.edges.let_go for event in events.tolist()]
-        return ((events != NOWHERE) & ((events == home) | let_go)).astype(np.float64)
+        at_home = (event == home) & (event != NOWHERE)
+        let_go = np.array([(each, home) in self.graph.edges.let_go for each in event.tolist()], dtype=bool)
+        seen = (at_home | let_go).astype(np.float64)
+        guessed = self._guessed(source, event, len(self.graph.events), begin, goal, seen, runs)
+        if not let_go.any():
+            return guessed
+        # Such walks are judged by their kin, as those are that an edge stands for
+        self.walks()
+        ends = event, np.full_like(event, home)
+        kin = [(hits[at], runs[at]) for at, (hits, runs) in zip(ends, self._kin, strict=True)]
+        return guessed._replace(guess=np.where(let_go, corrected(guessed.guess, kin), guessed.guess))
 
     def _short(self, guessed: Choices, least: int) -> Choices:
         """Return the guessed walks that are no longer than those of the graph.
@@ -261,8 +283,7 @@ class ChoiceModel:
         # There always is a way: at worst the walk straight to the goal
         targets = np.concatenate([part.target for part in parts])
         if n_events not in targets:
-            seen = self._seen(event, graph.locate(goal))
-            direct = self._guessed(here, event, n_events, start.point, goal[None], seen, runs)
+            direct = self._straight_on(here, event, start.point[None], goal, graph.locate(goal), runs)
             # One that would be longer than any walk in the graph is begun only where there is nothing else to do.
             if direct.steps[0] <= graph.walk_steps or not len(targets) or start.towards == n_events:
                 parts.append(direct)
@@ -272,3 +293,19 @@ class ChoiceModel:
             parts.append(self._guessed(here, event, start.towards, start.point, end, np.ones(1), runs))
         choices = Choices.join(parts)
         return choices._replace(source=np.full(len(choices.source), n_events + 1))
+
+
+def corrected(guess: np.ndarray, kin: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
+    """Return guessed shares, corrected by the runs of the walks' kin.
+
+    The guess counts for as many runs as it does everywhere, kin for a share of theirs.
+
+    :param guess: shape ``(n,)``
+    :param kin: weights of the runs of which the share is guessed, and of all, of each kind of kin, shapes ``(n,)``
+    """
+    total, weight = GUESS_RUNS * guess, np.full(len(guess), GUESS_RUNS)
+    for hits, runs in kin:
+        scale = np.minimum(KINSHIP, MOST_KINSHIP / np.maximum(runs, 1e-9))
+        total += scale * hits
+        weight += scale * runs
+    return np.clip(total / weight, 0.0, 1.0)

@@ -159,7 +159,8 @@ class SkillGraph:
             source, target = int(new_index[old_edges.source[row]]), int(new_index[old_edges.target[row]])
             if source != target:
                 self._pour(old_edges, row, source, target, new_index)
-        self.edges.let_go = {(int(new_index[source]), int(new_index[target])) for source, target in old_edges.let_go}
+        let_go = ((int(new_index[source]), int(new_index[target])) for source, target in old_edges.let_go)
+        self.edges.let_go = {(source, target) for source, target in let_go if source != target}
         self.version += 1
 
     def _build_index(self) -> dict[str, int]:

@@ -418,7 +418,7 @@ def check(graph: SkillGraph) -> None:
         assert source != target
         assert 0 <= source < n
         assert 0 <= target < n
-    assert all(0 <= end < n for pair in edges.let_go for end in pair)
+    assert all(0 <= source < n and 0 <= target < n and source != target for source, target in edges.let_go)
     assert (edges.forward + edges.backward > 0).all()
     assert (edges.crossing_steps >= 1).all()
     for column in (edges.successes, edges.success_steps, edges.failures, edges.landing_weight):

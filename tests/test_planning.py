@@ -582,17 +582,22 @@ def test_the_walk_to_a_goal_far_away_is_begun_only_where_there_is_nothing_else_t
 def test_that_there_is_no_edge_tells_nothing_of_a_walk_where_it_was_let_go() -> None:
     graph, model = line_graph(4, 3.0), WalkModel()
     model.coefficients[5] = -4.0  # of walks where nobody was seen to go
-    tried(graph, 0, 1, 10)
+    graph.crossed(0, 1, 10)
     goal = graph.centers[2] + [0.5, 0.0]
-    guesses = []
-    for crossed in (False, True):
-        if crossed:
-            graph.crossed(0, 2, 20)
-            graph.edges.keep(np.arange(2))
+
+    def guess() -> float:
         found = everything(graph, model, at(graph, 0), goal)
-        guesses.append(float(found.guess[row_of(found, 5, 4)]))
-    assert guesses[0] < 0.02
-    assert guesses[1] == pytest.approx(FIRST_GUESS)
+        return float(found.guess[row_of(found, 5, 4)])
+
+    assert guess() < 0.02
+    graph.crossed(0, 2, 20)
+    graph.edges.keep(np.arange(2))
+    assert guess() == pytest.approx(FIRST_GUESS)
+    # Like an untried walk that an edge stands for it is judged by what others do from the same event
+    tried(graph, 0, 1, 10)
+    assert guess() > FIRST_GUESS + 0.2
+    graph.crossed(0, 3, 30)
+    assert guess() == ChoiceModel(graph, model).walks().guess[-2]
 
 
 def test_a_record_that_is_bad_is_no_reason_to_guess() -> None:
