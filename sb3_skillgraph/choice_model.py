@@ -19,6 +19,11 @@ FAR = 2.0
 BESIDE = 0.98
 
 
+#: Weights of runs by the events that walks begin in, and by those that they lead to: of some of the runs, and of all. Of
+#: hasty walks, which are no kin of others, they stand behind those of all others.
+ByEnd = list[tuple[np.ndarray, np.ndarray]]
+
+
 class ChoiceModel:
     """Makes choices out of the graph's records.
 
@@ -30,8 +35,7 @@ class ChoiceModel:
         self.graph = graph
         self.model = model
         self._walks: tuple[tuple[int, int], Choices] | None = None
-        #: Of all walks but hasty ones, by the events that they begin in and by those that they lead to: successes and runs.
-        self._kin: list[tuple[np.ndarray, np.ndarray]] = []
+        self._kin: ByEnd = []  # successes and runs of these walks
 
     @property
     def version(self) -> tuple[int, int]:
@@ -57,14 +61,16 @@ class ChoiceModel:
         edges, aging, kinds = self.graph.edges, self.graph.aging(), self.kinds()
         # What has been tried tells by its own runs, what has not by what others of its kind and place have done
         successes, failures = edges.successes * aging, edges.failures * aging
-        hasty = self.model.is_hasty(kinds)
-        guess = self._with_kin(self.model.success(kinds), hasty, successes, successes + failures)
-        self._kin = self._by_end(0, ~hasty * successes, ~hasty * (successes + failures))
+        apart = len(self.graph.events) * self.model.is_hasty(kinds)  # hasty walks have events of their own, behind the others
+        ends = edges.source + apart, edges.target + apart
+        self._kin = self._by_end(ends, successes, successes + failures)
+        guess = self._with_kin(self.model.success(kinds), ends, self._kin, successes, successes + failures)
         # A guess of the steps counts for one run.
         steps = (self.model.steps(kinds) + edges.success_steps * aging) / (1.0 + successes)
         failed_steps = (self.model.patience * timeout(steps) + edges.failure_steps * aging) / (1.0 + failures)
         failed_steps = np.minimum(failed_steps, timeout(steps))  # it may have been allowed more when it was slower
-        loss = self._with_kin(self._loss(kinds), hasty, self.far_failures(kinds), failures)
+        far = self.far_failures(kinds)
+        loss = self._with_kin(self._loss(kinds), ends, self._by_end(ends, far, failures), far, failures)
         weight = edges.landing_weight * aging[:, None]
         times = (steps, failed_steps)
         return Choices(edges.source, edges.target, guess, successes, failures, *times, loss, edges.landing, weight)
@@ -72,31 +78,40 @@ class ChoiceModel:
     def _loss(self, kinds: Kind) -> np.ndarray:
         return np.where(self.model.is_hasty(kinds), self.model.loss[0], self.model.loss[1])
 
-    def _with_kin(self, guess: np.ndarray, hasty: np.ndarray, hits: np.ndarray, runs: np.ndarray) -> np.ndarray:
-        """Return a guessed share, corrected by the runs of its kin: edges out of the same event, and into the same one.
+    def _by_end(self, ends: tuple[np.ndarray, np.ndarray], hits: np.ndarray, runs: np.ndarray) -> ByEnd:
+        """Return the weights of the runs of edges, summed by the events at their ends.
 
-        :param guess: shape ``(n_edges,)``
-        :param hasty: which edges are hasty: those and others are no kin
-        :param hits: weight of the runs of each edge of which the share is guessed
+        :param ends: where each begins, and where it leads, shapes ``(n_edges,)``
+        :param hits: weight of some of the runs of each edge
         :param runs: weight of all of its runs
         """
-        # Hasty ones have events of their own, after the others
-        apart = len(self.graph.events) * hasty
-        ends = self.graph.edges.source + apart, self.graph.edges.target + apart
-        by_end = zip(ends, self._by_end(apart, hits, runs), strict=True)
-        kin = [(all_hits[at] - hits, all_runs[at] - runs) for at, (all_hits, all_runs) in by_end]  # no run for itself
-        return corrected(guess, kin)
-
-    def _by_end(self, apart: np.ndarray | int, hits: np.ndarray, runs: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Return the weights of runs of edges, summed by the events that they begin in, and by those that they lead to.
-
-        :param apart: what to add to the indices of the events of each edge
-        :param hits: weight of some of the runs of each edge, shape ``(n_edges,)``
-        :param runs: weight of all of its runs
-        """
-        edges, n = self.graph.edges, 2 * len(self.graph.events)
-        ends = edges.source + apart, edges.target + apart
+        n = 2 * len(self.graph.events)
         return [(np.bincount(events, hits, n), np.bincount(events, runs, n)) for events in ends]
+
+    @staticmethod
+    def _with_kin(
+        guess: np.ndarray,
+        ends: tuple[np.ndarray, np.ndarray],
+        by_end: ByEnd,
+        hits: np.ndarray | float = 0.0,
+        runs: np.ndarray | float = 0.0,
+    ) -> np.ndarray:
+        """Return guessed shares, corrected by the runs of kin: of edges out of the same event, and into the same one.
+
+        :param guess: shape ``(n,)``
+        :param ends: where each walk begins, and where it leads, shapes ``(n,)``
+        :param by_end: the runs of all edges
+        :param hits: weight of the runs of each walk of which the share is guessed
+        :param runs: weight of all of its runs
+        """
+        # The guess counts for as many runs as it does everywhere, kin for a share of theirs, no run for itself
+        total, weight = GUESS_RUNS * guess, np.full(len(guess), GUESS_RUNS)
+        for events, (all_hits, all_runs) in zip(ends, by_end, strict=True):
+            kin_hits, kin_runs = all_hits[events] - hits, all_runs[events] - runs
+            scale = np.minimum(KINSHIP, MOST_KINSHIP / np.maximum(kin_runs, 1e-9))
+            total += scale * kin_hits
+            weight += scale * kin_runs
+        return np.clip(total / weight, 0.0, 1.0)
 
     def far_failures(self, kinds: Kind) -> np.ndarray:
         """Return the weight of the failed runs of each edge that landed far away or nowhere, shape ``(n_edges,)``.
@@ -183,10 +198,9 @@ class ChoiceModel:
         if not let_go.any():
             return guessed
         # Such walks are judged by their kin, as those are that an edge stands for
-        self.walks()
-        ends = event, np.full_like(event, home)
-        kin = [(hits[at], runs[at]) for at, (hits, runs) in zip(ends, self._kin, strict=True)]
-        return guessed._replace(guess=np.where(let_go, corrected(guessed.guess, kin), guessed.guess))
+        self.walks()  # with their kin as of now
+        judged = self._with_kin(guessed.guess, (event, np.full_like(event, home)), self._kin)
+        return guessed._replace(guess=np.where(let_go, judged, guessed.guess))
 
     def _short(self, guessed: Choices, least: int) -> Choices:
         """Return the guessed walks that are no longer than those of the graph.
@@ -293,19 +307,3 @@ class ChoiceModel:
             parts.append(self._guessed(here, event, start.towards, start.point, end, np.ones(1), runs))
         choices = Choices.join(parts)
         return choices._replace(source=np.full(len(choices.source), n_events + 1))
-
-
-def corrected(guess: np.ndarray, kin: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
-    """Return guessed shares, corrected by the runs of the walks' kin.
-
-    The guess counts for as many runs as it does everywhere, kin for a share of theirs.
-
-    :param guess: shape ``(n,)``
-    :param kin: weights of the runs of which the share is guessed, and of all, of each kind of kin, shapes ``(n,)``
-    """
-    total, weight = GUESS_RUNS * guess, np.full(len(guess), GUESS_RUNS)
-    for hits, runs in kin:
-        scale = np.minimum(KINSHIP, MOST_KINSHIP / np.maximum(runs, 1e-9))
-        total += scale * hits
-        weight += scale * runs
-    return np.clip(total / weight, 0.0, 1.0)
