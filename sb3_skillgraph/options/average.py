@@ -46,10 +46,9 @@ class AveragedPolicy:
         window = max(SHARE * (self.learner._n_updates - YOUNG), 1.0)
         weight = 1.0 - (1.0 - 1.0 / window) ** n_updates
         now, mean = self._parameters
-        # SB3's polyak_update, in two calls for all layers
+        # SB3's polyak_update, in one call for all layers
         with th.no_grad():
-            th._foreach_mul_(mean, 1.0 - weight)
-            th._foreach_add_(mean, now, alpha=weight)
+            th._foreach_lerp_(mean, now, weight)
         for now_buffer, mean_buffer in zip(*self._buffers, strict=True):
             mean_buffer.copy_(now_buffer)
 
