@@ -83,21 +83,6 @@ class Linear(NamedTuple):
         return self.constant + self.matrix @ values
 
 
-class Known(NamedTuple):
-    """What training has shown, worked out once for all goals; choices are sorted by their source.
-
-    :param order: rows of the graph's edges in this order
-    :param linear: what they cost
-    :param sources: the vertices that have any
-    :param first: where the choices of each of those begin
-    """
-
-    order: np.ndarray
-    linear: Linear
-    sources: np.ndarray
-    first: np.ndarray
-
-
 class Solution(NamedTuple):
     """The values of all vertices, and what can be done on the way.
 
@@ -173,7 +158,7 @@ class Planner:
         self.graph = graph
         self.choice_model = ChoiceModel(graph, model)
         self.horizon = horizon
-        self._known: dict[float, tuple[tuple[int, int], Known]] = {}
+        self._known: dict[float, tuple[tuple[int, int], Linear]] = {}
 
     @property
     def lost(self) -> float:
@@ -205,9 +190,8 @@ class Planner:
         known, walks = self._worked_out(stance), self.choice_model.walks()
         # Edges that the episode has shown more of stand among its own choices, and not among those of training
         replaced, episode = self.choice_model.of_episode(start, goal, runs, everywhere)
-        constant = known.linear.constant
-        if len(replaced):
-            constant = np.where(np.isin(known.order, replaced), np.inf, constant)
+        constant = known.constant.copy()
+        constant[replaced] = np.inf
         linear = Linear.of(episode, stance, n_vertices)
         values = np.full(n_vertices, self.lost)
         values[n_events] = 0.0
@@ -215,28 +199,22 @@ class Planner:
             before = values
             # One sweep: every vertex takes its cheapest choice, by the values of the last sweep
             values = np.full(n_vertices, self.lost)
-            costs, episode_costs = constant + known.linear.matrix @ before, linear.costs(before)
-            if len(known.first):
-                values[known.sources] = np.minimum(np.minimum.reduceat(costs, known.first), self.lost)
+            costs, episode_costs = constant + known.matrix @ before, linear.costs(before)
+            np.minimum.at(values, walks.source, costs)
             np.minimum.at(values, episode.source, episode_costs)
             values[n_events] = 0.0
             if (before - values).max() < PRECISION:
                 break
-        # Back into the order of the graph's edges, as whoever reads the solution knows them
-        in_order = np.empty_like(costs)
-        in_order[known.order] = np.minimum(costs, self.lost)
-        in_order[replaced] = np.inf
-        return Solution(values, walks, in_order, episode, np.minimum(episode_costs, self.lost))
+        costs = np.minimum(costs, self.lost)
+        costs[replaced] = np.inf
+        return Solution(values, walks, costs, episode, np.minimum(episode_costs, self.lost))
 
-    def _worked_out(self, stance: float) -> Known:
+    def _worked_out(self, stance: float) -> Linear:
         """Return what training has shown as it costs; the same until something is learned."""
         version = self.choice_model.version
         if stance not in self._known or self._known[stance][0] != version:
-            walks = self.choice_model.walks()
-            order = np.argsort(walks.source, kind="stable")
-            sources, first = np.unique(walks.source[order], return_index=True)
-            linear = Linear.of(walks.take(order), stance, len(self.graph.events) + 3)
-            self._known[stance] = version, Known(order, linear, sources, first)
+            linear = Linear.of(self.choice_model.walks(), stance, len(self.graph.events) + 3)
+            self._known[stance] = version, linear
         return self._known[stance][1]
 
     # -- what a plan is -----------------------------------------------------------------------------------------------
