@@ -1,7 +1,7 @@
 """What options do as actions of an SMDP: when they can be taken, and how they run."""
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -32,38 +32,6 @@ class Running(NamedTuple):
     aim: np.ndarray
     timeout: float
     single: bool = False
-
-
-class Actions(Protocol):
-    """Options as actions, in the order of their making; last comes the walk straight to the goal, if there is one."""
-
-    has_direct: bool
-    #: What must be remembered between two steps.
-    state: Any
-
-    def reset(self, observation: Observation) -> None:
-        """An episode begins."""
-
-    def n(self) -> int:
-        """Return how many there are by now, without the walk straight to the goal."""
-
-    def action_of(self, id: str) -> int | None:
-        """Return an option's action; None for the walk straight to the goal, and a KeyError for an unknown id."""
-
-    def masks(self, observation: Observation) -> np.ndarray:
-        """Tell which of those can be taken, bool array of shape ``(n,)``."""
-
-    def begin(self, observation: Observation, action: int | None) -> Running:
-        """Begin to run an option; None for the walk straight to the goal."""
-
-    def act(self, run: Running, observation: Observation) -> np.ndarray:
-        """Return what it does, scaled to [-1, 1], shape ``(action_dim,)``."""
-
-    def fate(self, run: Running, observation: Observation, steps: int, stuck: bool) -> Fate:
-        """Tell what has become of it after so many steps."""
-
-    def primitive(self) -> None:
-        """A primitive action was taken in between."""
 
 
 def batch_of_one(observation: Observation) -> Observation:

@@ -11,7 +11,7 @@ from gymnasium import spaces
 from sb3_skillgraph.options.execution import Fate
 from sb3_skillgraph.options.option import Option
 from sb3_skillgraph.options.walk import Walk, Walks
-from sb3_skillgraph.smdp.actions import Actions, OptionActions, Running, WalkActions
+from sb3_skillgraph.smdp.actions import OptionActions, Running, WalkActions
 
 MASK = "action_mask"
 MOST_AXES = 2  # up to so many dimensions of actions, primitive actions push along each axis
@@ -254,7 +254,7 @@ class OptionsEnv(gym.Wrapper):
         return {**observation, MASK: self.masks_at(observation).astype(np.int8)}
 
 
-def _actions(options: Sequence[Option] | Sequence[Walk], direct: Option | None, timeout: int) -> Actions:
+def _actions(options: Sequence[Option] | Sequence[Walk], direct: Option | None, timeout: int) -> OptionActions | WalkActions:
     """Return what runs the options."""
     if isinstance(options, Walks) and direct is None:
         return WalkActions(options.runner)
