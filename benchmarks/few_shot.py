@@ -19,11 +19,12 @@ import gymnasium as gym
 import numpy as np
 import torch as th
 from joblib import Parallel, delayed
+from stable_baselines3.common.type_aliases import PolicyPredictor
 
 from benchmarks.collect import RESULTS, Row, write
 from sb3_skillgraph import SkillGraphAgent, __version__
 from sb3_skillgraph.envs import MazeGeometry, MazeMap
-from sb3_skillgraph.evaluation import Predictor, run_pair
+from sb3_skillgraph.evaluation import run_pair
 from sb3_skillgraph.experiments.console import commit
 
 ENV = "SkillGraph/PointMaze-v0"
@@ -68,7 +69,7 @@ class Halves:
                 return start, goal
 
 
-def success(agent: Predictor, env: gym.Env, pairs: list[tuple[np.ndarray, np.ndarray]]) -> float:
+def success(agent: PolicyPredictor, env: gym.Env, pairs: list[tuple[np.ndarray, np.ndarray]]) -> float:
     """Return the share of pairs of start and goal between which the agent finds its way."""
     return float(np.mean([run_pair(agent, env, start, goal, np.nan).success for start, goal in pairs]))
 

@@ -23,11 +23,12 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.type_aliases import PolicyPredictor
 
 from benchmarks.few_shot import success
 from sb3_skillgraph import SkillGraphAgent, __version__
 from sb3_skillgraph.baselines import make_her
-from sb3_skillgraph.evaluation import Predictor, sample_pairs
+from sb3_skillgraph.evaluation import sample_pairs
 from sb3_skillgraph.hyperparams import load_hyperparams
 
 ENOUGH = 0.95
@@ -69,7 +70,7 @@ class StopAt(BaseCallback):
         return time.perf_counter() < self.end
 
 
-def tested(agent: Predictor, env: gym.Env, pairs: list[tuple[np.ndarray, np.ndarray]]) -> float:
+def tested(agent: PolicyPredictor, env: gym.Env, pairs: list[tuple[np.ndarray, np.ndarray]]) -> float:
     """Return an agent's success on pairs of start and goal; chance, where an environment has any, is the same each time."""
     env.reset(seed=0)
     return success(agent, env, pairs)

@@ -12,11 +12,12 @@ import numpy as np
 import torch as th
 from rich.console import Console
 from rich.table import Table
+from stable_baselines3.common.type_aliases import PolicyPredictor
 
 from sb3_skillgraph.agent import SkillGraphAgent
 from sb3_skillgraph.baselines import RandomWalk, StraightOn
 from sb3_skillgraph.envs import geometry_of
-from sb3_skillgraph.evaluation import NoPairsError, PairsResult, Predictor, evaluate_pairs
+from sb3_skillgraph.evaluation import NoPairsError, PairsResult, evaluate_pairs
 from sb3_skillgraph.experiments.commands import add_compare, add_figure, add_status
 from sb3_skillgraph.experiments.console import UserError, assignment, for_people, positive
 from sb3_skillgraph.experiments.opening import (
@@ -223,7 +224,7 @@ def _demo(args: argparse.Namespace) -> int:
     del hyperparams["n_timesteps"]
     agent = train(DEMO_ENV, {}, hyperparams, args.steps, args.seed, args.out)
     assert isinstance(agent.action_space, gym.spaces.Box)
-    methods: dict[str, Predictor] = {
+    methods: dict[str, PolicyPredictor] = {
         "skill graph": agent,
         "walker, straight on": StraightOn(agent),
         "random walk": RandomWalk(agent.action_space, args.seed),

@@ -2,10 +2,11 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
+from stable_baselines3.common.type_aliases import PolicyPredictor
 from tqdm import tqdm
 
 from sb3_skillgraph.agent import SkillGraphAgent
@@ -13,19 +14,6 @@ from sb3_skillgraph.envs import MazeGeometry, find
 from sb3_skillgraph.goal_env import metric_of
 from sb3_skillgraph.hyperparams import make_recommended
 from sb3_skillgraph.planning import DIRECT
-
-
-class Predictor(Protocol):
-    """Anything that acts as SB3's models do."""
-
-    def predict(
-        self,
-        observation: Any,
-        state: tuple[np.ndarray, ...] | None = None,
-        episode_start: np.ndarray | None = None,
-        deterministic: bool = False,
-    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
-        """Return actions and the state to pass back in."""
 
 
 class NoPairsError(ValueError):
@@ -194,7 +182,7 @@ def sample_pairs(
 
 
 def evaluate_pairs(
-    agent: Predictor,
+    agent: PolicyPredictor,
     env: gym.Env | str,
     *,
     env_kwargs: dict[str, Any] | None = None,
@@ -256,7 +244,9 @@ def evaluate_pairs(
             made.close()
 
 
-def run_pair(agent: Predictor, env: gym.Env, start: np.ndarray | None, goal: np.ndarray | None, cells: float) -> PairResult:
+def run_pair(
+    agent: PolicyPredictor, env: gym.Env, start: np.ndarray | None, goal: np.ndarray | None, cells: float
+) -> PairResult:
     """Let an agent go from a start to a goal; the episode ends there.
 
     :param agent: anything with SB3's ``predict``
@@ -291,7 +281,7 @@ def run_pair(agent: Predictor, env: gym.Env, start: np.ndarray | None, goal: np.
     return PairResult(start, goal, cells, success, steps, status, trace, nearest, stuck)
 
 
-def _judge(agent: Predictor, env: gym.Env) -> Callable[[Any, dict[str, Any]], bool]:
+def _judge(agent: PolicyPredictor, env: gym.Env) -> Callable[[Any, dict[str, Any]], bool]:
     """Return what tells from an observation and an info whether the goal is reached."""
     metric = metric_of(env)
     if metric is None:

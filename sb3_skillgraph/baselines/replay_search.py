@@ -125,7 +125,7 @@ class ReplaySearch:
 
     def predict(
         self,
-        observation: dict[str, np.ndarray],
+        observation: np.ndarray | dict[str, np.ndarray],
         state: tuple[np.ndarray, ...] | None = None,
         episode_start: np.ndarray | None = None,
         deterministic: bool = True,
@@ -139,6 +139,7 @@ class ReplaySearch:
         :param deterministic: not used: there is no noise
         :return: an action in the environment's own bounds, and the state to pass back in
         """
+        assert isinstance(observation, dict)
         if state is None:
             now = self._begin(observation, np.empty((0, 2), dtype=int))
         else:

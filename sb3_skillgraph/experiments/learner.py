@@ -8,8 +8,8 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from stable_baselines3.common.type_aliases import PolicyPredictor
 
-from sb3_skillgraph.evaluation import Predictor
 from sb3_skillgraph.hyperparams import did_you_mean
 
 Check = Callable[[int], None]
@@ -26,7 +26,7 @@ class Learner(ABC):
 
     #: Whether it can go on from a checkpoint as if nothing had happened; others begin anew.
     resumable = False
-    policy: Predictor
+    policy: PolicyPredictor
 
     @abstractmethod
     def __init__(self, env_id: str, env_kwargs: dict[str, Any], seed: int, arguments: dict[str, Any]) -> None: ...
@@ -74,7 +74,7 @@ class Learner(ABC):
         """
 
     @abstractmethod
-    def practise(self, env: gym.Env, start: np.ndarray, goal: np.ndarray, stretches: list[int]) -> Iterator[Predictor]:
+    def practise(self, env: gym.Env, start: np.ndarray, goal: np.ndarray, stretches: list[int]) -> Iterator[PolicyPredictor]:
         """Go on learning, as a copy, with one start and one goal, as at the paper's test time (section 4.2).
 
         :param env: begins every episode at the start, with the goal, and ends it there
@@ -84,7 +84,7 @@ class Learner(ABC):
         :return: what is to be tested: at once, and after every stretch
         """
 
-    def rival(self, algorithm: str, arguments: dict[str, Any] | None = None) -> Predictor:
+    def rival(self, algorithm: str, arguments: dict[str, Any] | None = None) -> PolicyPredictor:
         """Return another way to act by what has been learned.
 
         :param algorithm: one of ``RIVALS``

@@ -11,6 +11,7 @@ import numpy as np
 from gymnasium import spaces
 from stable_baselines3 import DDPG, TD3
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.type_aliases import PolicyPredictor
 
 from sb3_skillgraph.agent import SkillGraphAgent
 from sb3_skillgraph.baselines import (
@@ -24,7 +25,6 @@ from sb3_skillgraph.baselines import (
     make_her,
     make_uvfa,
 )
-from sb3_skillgraph.evaluation import Predictor
 from sb3_skillgraph.experiments.learner import Check, Learner, check_names
 from sb3_skillgraph.experiments.run_folder import AGENT, load_agent, save_agent, stops
 from sb3_skillgraph.hyperparams import check_hyperparams, load_hyperparams, make_recommended
@@ -62,7 +62,7 @@ class SkillGraphLearner(Learner):
         return _recommended(env_id, arguments)
 
     @property
-    def policy(self) -> Predictor:  # type: ignore[override]
+    def policy(self) -> PolicyPredictor:  # type: ignore[override]
         """What is tested."""
         return self.agent
 
@@ -81,7 +81,7 @@ class SkillGraphLearner(Learner):
         """Load both."""
         self.agent = load_agent(folder, self.env)
 
-    def practise(self, env: gym.Env, start: np.ndarray, goal: np.ndarray, stretches: list[int]) -> Iterator[Predictor]:
+    def practise(self, env: gym.Env, start: np.ndarray, goal: np.ndarray, stretches: list[int]) -> Iterator[PolicyPredictor]:
         """Adapt a copy; its episodes do not end at the goal."""
         twin = self.agent.copy(gym.make(self.env.spec))  # type: ignore[arg-type]
         yield twin
@@ -89,7 +89,7 @@ class SkillGraphLearner(Learner):
             twin.adapt(goal, start=start, total_timesteps=n_steps)
             yield twin
 
-    def rival(self, algorithm: str, arguments: dict[str, Any] | None = None) -> Predictor:
+    def rival(self, algorithm: str, arguments: dict[str, Any] | None = None) -> PolicyPredictor:
         """Let the same walker go by something else than the graph."""
         return RIVALS[algorithm](self.agent, **(arguments or {}))
 
@@ -150,7 +150,7 @@ class GoalConditionedLearner(Learner):
         """Save the model."""
         self.policy.save(folder / "model.zip")
 
-    def practise(self, env: gym.Env, start: np.ndarray, goal: np.ndarray, stretches: list[int]) -> Iterator[Predictor]:
+    def practise(self, env: gym.Env, start: np.ndarray, goal: np.ndarray, stretches: list[int]) -> Iterator[PolicyPredictor]:
         """Let a copy go on learning."""
         model, experience = io.BytesIO(), io.BytesIO()
         self.policy.save(model)
@@ -178,7 +178,7 @@ class HERLearner(GoalConditionedLearner):
 
     make = staticmethod(make_her)
 
-    def practise(self, env: gym.Env, start: np.ndarray, goal: np.ndarray, stretches: list[int]) -> Iterator[Predictor]:
+    def practise(self, env: gym.Env, start: np.ndarray, goal: np.ndarray, stretches: list[int]) -> Iterator[PolicyPredictor]:
         """Let a copy go on learning, paid as before."""
         rule = self.policy.get_env().get_attr("rule")[0]  # type: ignore[union-attr]
         yield from super().practise(OptionTask(env, rule), start, goal, stretches)
@@ -211,7 +211,7 @@ class RecipeLearner(Learner):
         """Save the agent."""
         self.recipe.agent.save(folder / AGENT)
 
-    def practise(self, env: gym.Env, start: np.ndarray, goal: np.ndarray, stretches: list[int]) -> Iterator[Predictor]:
+    def practise(self, env: gym.Env, start: np.ndarray, goal: np.ndarray, stretches: list[int]) -> Iterator[PolicyPredictor]:
         """Let a copy go on learning."""
         twin = self.recipe.copy(env)
         yield twin.policy
@@ -249,7 +249,7 @@ class CoveringOptionsLearner(Learner):
         """Save what chooses, and the options' policies."""
         self.learner.save(folder)
 
-    def practise(self, env: gym.Env, start: np.ndarray, goal: np.ndarray, stretches: list[int]) -> Iterator[Predictor]:
+    def practise(self, env: gym.Env, start: np.ndarray, goal: np.ndarray, stretches: list[int]) -> Iterator[PolicyPredictor]:
         """Let a copy go on learning."""
         twin = self.learner.copy(env)
         yield _Exploring(twin)
@@ -292,7 +292,7 @@ class RandomWalkLearner(Learner):
     def save(self, folder: Path) -> None:
         """There is nothing to save."""
 
-    def practise(self, env: gym.Env, start: np.ndarray, goal: np.ndarray, stretches: list[int]) -> Iterator[Predictor]:
+    def practise(self, env: gym.Env, start: np.ndarray, goal: np.ndarray, stretches: list[int]) -> Iterator[PolicyPredictor]:
         """Only be tested."""
         yield self.policy
         for _ in stretches:
@@ -300,7 +300,7 @@ class RandomWalkLearner(Learner):
 
 
 #: Other ways to act by what a skill graph has learned.
-RIVALS: dict[str, Callable[..., Predictor]] = {"straight_on": StraightOn, "replay_search": ReplaySearch}
+RIVALS: dict[str, Callable[..., PolicyPredictor]] = {"straight_on": StraightOn, "replay_search": ReplaySearch}
 
 ALGORITHMS: dict[str, type[Learner]] = {
     "skill_graph": SkillGraphLearner,

@@ -4,8 +4,9 @@ from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
+from stable_baselines3.common.type_aliases import PolicyPredictor
 
-from sb3_skillgraph.evaluation import PairResult, PairsResult, Predictor, evaluate_pairs, run_pair
+from sb3_skillgraph.evaluation import PairResult, PairsResult, evaluate_pairs, run_pair
 from sb3_skillgraph.experiments.learner import Learner
 from sb3_skillgraph.experiments.plan import RunSpec
 from sb3_skillgraph.hyperparams import make_recommended
@@ -49,7 +50,7 @@ def _plain_pair(pair: PairResult) -> dict[str, Any]:
     }
 
 
-def test_policy(policy: Predictor, spec: RunSpec, n_steps: int) -> Test:
+def test_policy(policy: PolicyPredictor, spec: RunSpec, n_steps: int) -> Test:
     """Test what a run has learned.
 
     :param policy: what acts
@@ -65,7 +66,7 @@ def test_policy(policy: Predictor, spec: RunSpec, n_steps: int) -> Test:
         env.close()
 
 
-def _run_tasks(policy: Predictor, env: gym.Env, spec: RunSpec) -> list[list[PairResult]]:
+def _run_tasks(policy: PolicyPredictor, env: gym.Env, spec: RunSpec) -> list[list[PairResult]]:
     """Do the tasks that the environment brings, start and goal drawn around theirs."""
     noise = env.get_wrapper_attr("task_noise")
     rng = np.random.default_rng(spec.seed)

@@ -1,43 +1,24 @@
 """A policy over options, one environment step at a time."""
 
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
+from stable_baselines3.common.type_aliases import PolicyPredictor
 
 from sb3_skillgraph.options.execution import Fate
 from sb3_skillgraph.smdp.actions import Running
 from sb3_skillgraph.smdp.options_env import MASK, OptionsEnv
 
 
-class HighLevel(Protocol):
-    """What chooses options: SB3's ``predict`` on the observations of an :class:`~sb3_skillgraph.OptionsEnv`."""
-
-    def predict(
-        self,
-        observation: np.ndarray | dict[str, np.ndarray],
-        state: tuple[np.ndarray, ...] | None = None,
-        episode_start: np.ndarray | None = None,
-        deterministic: bool = False,
-    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
-        """Choose an option.
-
-        :param observation: one observation
-        :param state: what the last call returned
-        :param episode_start: where an episode begins, and the state is forgotten
-        :param deterministic: whether to choose the best
-        :return: the action, and the state
-        """
-
-
 class FlatPolicy:
     """
     Acts in the wrapped environment of an :class:`~sb3_skillgraph.OptionsEnv` as its high level would have it.
 
-    :param high_level: chooses options
+    :param high_level: chooses options: SB3's ``predict`` on the observations of an ``OptionsEnv``
     :param env: knows how options run; it is not stepped
     """
 
-    def __init__(self, high_level: HighLevel, env: OptionsEnv) -> None:
+    def __init__(self, high_level: PolicyPredictor, env: OptionsEnv) -> None:
         self.high_level = high_level
         self.env = env
 
