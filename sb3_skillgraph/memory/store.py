@@ -4,6 +4,8 @@ from typing import Any
 
 import numpy as np
 
+from sb3_skillgraph.checking import anything, array, entries, whole
+
 _FLAGS = ("terminated", "stuck")
 _COLUMNS = ("observation", "achieved_goal", "next_observation", "next_achieved_goal", "action", "goal")
 
@@ -166,27 +168,7 @@ class TransitionStore:
 
         :raises ValueError: if the stored rows do not fit this store
         """
-        expected = self.get_state().keys()
-        if state.keys() != expected or not isinstance(state["columns"], dict) or set(state["columns"]) != set(_COLUMNS):
-            raise ValueError(
-                f"A stored replay buffer has the entries {', '.join(expected)}; here are {', '.join(map(str, state))}."
-            )
-        for name in ("n_envs", "capacity"):
-            if state[name] != getattr(self, name):
-                raise ValueError(
-                    f"The stored replay buffer has {name}={state[name]}, this agent {name}={getattr(self, name)}: "
-                    "load it into an agent made with the same buffer_size and number of environments."
-                )
-        for name in _COLUMNS:
-            own, stored = self._data[:1, self._slices[name]].shape[1:], np.shape(state["columns"][name])[1:]
-            if stored != own:
-                raise ValueError(
-                    f"The stored replay buffer has {name} of shape {stored}, this agent's environment gives {own}."
-                )
-        self._check_rows(state)
-        for name in _COLUMNS:
-            if not np.isfinite(state["columns"][name]).all():
-                raise ValueError(f"The {name} of the stored replay buffer holds NaN or inf.")
+        self._check(state)
         self.total = int(state["total"])
         at = np.arange(self.oldest, self.total) % self.capacity
         for name in _COLUMNS:
@@ -198,28 +180,31 @@ class TransitionStore:
         self._n_trajectories = int(state["n_trajectories"])
         self._last_row = np.array(state["last_row"], dtype=np.int64)
 
-    def _check_rows(self, state: dict[str, Any]) -> None:
-        """Refuse rows and counters that do not belong together."""
+    def _check(self, state: Any) -> None:
+        """Refuse rows and counters that do not fit this store, or do not belong together."""
+        where = "The stored replay buffer"
+        names = ("total", "n_envs", "capacity", "columns", *_FLAGS, "trajectory", "current", "n_trajectories", "last_row")
+        counts = {"total": whole(), "n_trajectories": whole(1)}
+        entries(**{name: counts.get(name, anything) for name in names})(state, where)
+        for name in ("n_envs", "capacity"):
+            if state[name] != getattr(self, name):
+                raise ValueError(
+                    f"The stored replay buffer has {name}={state[name]}, this agent {name}={getattr(self, name)}: "
+                    "load it into an agent made with the same buffer_size and number of environments."
+                )
         total, n_trajectories = state["total"], state["n_trajectories"]
-        if not (isinstance(total, int) and isinstance(n_trajectories, int) and 0 <= total < 2**62 and n_trajectories >= 0):
-            raise ValueError(f"The stored replay buffer counts {total!r} rows of {n_trajectories!r} trajectories.")
         n = min(total, self.capacity)
-        shapes = {"terminated": (n,), "stuck": (n,), "trajectory": (n,), "current": (self.n_envs,)}
-        for name, shape in shapes.items():
-            if np.shape(state[name]) != shape or np.asarray(state[name]).dtype.kind != ("b" if name in _FLAGS else "i"):
-                raise ValueError(f"The stored replay buffer has no {name} of shape {shape}.")
-        if any(len(state["columns"][name]) != n for name in _COLUMNS):
-            raise ValueError(f"The columns of the stored replay buffer have not {n} rows each.")
-        last = np.asarray(state["last_row"])
-        if last.ndim != 1 or last.dtype.kind != "i" or len(last) != n_trajectories or not len(last):
-            raise ValueError(f"The stored replay buffer has no last rows of {n_trajectories} trajectories.")
-        trajectory = np.asarray(state["trajectory"])
-        numbers = np.concatenate([trajectory, state["current"]])
-        fits = bool(numbers.min() >= 0 and numbers.max() < len(last) and last.max() < total)
-        if fits and n:
-            ahead = last[trajectory] - np.arange(total - n, total)
-            fits = bool((ahead >= 0).all() and (ahead % self.n_envs == 0).all())
-        if not fits:
+        widths = {name: own.stop - own.start for name, own in self._slices.items()}
+        entries(
+            True,
+            columns=entries(**{name: array((n, width)) for name, width in widths.items()}),
+            **{name: array((n,), "b") for name in _FLAGS},
+            trajectory=array((n,), "i", 0, n_trajectories - 1),
+            current=array((self.n_envs,), "i", 0, n_trajectories - 1),
+            last_row=array((n_trajectories,), "i", high=total - 1),
+        )(state, where)
+        ahead = state["last_row"][state["trajectory"]] - np.arange(total - n, total)
+        if not ((ahead >= 0) & (ahead % self.n_envs == 0)).all():
             raise ValueError("The trajectories of the stored replay buffer are not those of its rows.")
 
 
