@@ -8,7 +8,7 @@ NOWHERE = -1
 #: Different events in which failed runs of one edge have landed that are told apart.
 MAX_LANDINGS = 4
 
-_INDICES, _LANDINGS = ("source", "target"), ("landing", "landing_weight")
+_INDICES = ("source", "target")
 #: What runs write into a record: it ages.
 RECORD = ("successes", "success_steps", "failures", "failure_steps")
 _NUMBERS = ("forward", "backward", "crossing_steps", *RECORD, "updated")

@@ -47,9 +47,9 @@ class SkillGraph:
         self.edges = Edges()
         self._now = 0.0
         self.version = 0  # rises with every change
-        self.visits = np.zeros(64)  # of each event
-        self.barren = np.zeros(64)  # explorations from each event, since one found something
-        self._centers = np.zeros((64, goal_dim))
+        self.centers = np.zeros((0, goal_dim))  # of the events
+        self.visits = np.zeros(0)  # of each event
+        self.barren = np.zeros(0)  # explorations from each event, since one found something
         self.walk_ids: list[str] = []  # of the walks to the events, in their order
         self._index: dict[str, int] = {}  # of events, by their ids and by those of the walks to them
         self.n_made = 0  # events so far, those that were merged included
@@ -69,11 +69,6 @@ class SkillGraph:
         self.version += 1
 
     # -- events -------------------------------------------------------------------------------------------------------
-
-    @property
-    def centers(self) -> np.ndarray:
-        """Centres of the events, shape ``(n_events, goal_dim)``."""
-        return self._centers[: len(self.events)]
 
     def index(self, id: str) -> int:
         """Return the index of an event, or of the event that a walk leads to; ``NOWHERE`` for an id of neither."""
@@ -108,13 +103,10 @@ class SkillGraph:
         """
         i = len(self.events)
         event = Event(f"e{self.n_made}", np.array(center, dtype=np.float64), self.metric, salient)
-        if i == len(self._centers):
-            self._centers = np.concatenate([self._centers, np.zeros_like(self._centers)])
-            self.visits = np.concatenate([self.visits, np.zeros_like(self.visits)])
-            self.barren = np.concatenate([self.barren, np.zeros_like(self.barren)])
         self.events.append(event)
         self.walk_ids.append(f"w{self.n_made}")
-        self._centers[i], self.visits[i], self.barren[i] = event.center, 0.0, 0.0
+        self.centers = np.concatenate([self.centers, event.center[None]])
+        self.visits, self.barren = np.append(self.visits, 0.0), np.append(self.barren, 0.0)
         self._index[event.id] = self._index[self.walk_ids[i]] = i
         self.n_made += 1
         self.version += 1
@@ -136,13 +128,11 @@ class SkillGraph:
         order = sorted(range(len(self.events)), key=lambda i: (not self.events[i].salient, i))
         kept: list[int] = []
         for i in order:
-            near = self.metric.distance(self._centers[kept], self._centers[i]) < self.cover_radius
+            near = self.metric.distance(self.centers[kept], self.centers[i]) < self.cover_radius
             if not near.any():
                 kept.append(i)
         kept.sort()
-        centers = self._centers[kept]
-        distances = self.metric.distance(self.centers[:, None], centers)
-        new_index = distances.argmin(axis=1)
+        new_index = self.metric.distance(self.centers[:, None], self.centers[kept]).argmin(axis=1)
         self._rename(kept, new_index)
         return new_index
 
@@ -151,9 +141,9 @@ class SkillGraph:
         self.events = [self.events[i] for i in kept]
         self.walk_ids = [self.walk_ids[i] for i in kept]
         self._index = self._build_index()
-        self._centers[: len(kept)] = self._centers[kept]
-        for counts in (self.visits, self.barren):
-            counts[:] = np.bincount(new_index, counts[: len(new_index)], len(counts))
+        self.centers = self.centers[kept]
+        self.visits = np.bincount(new_index, self.visits).astype(np.float64)
+        self.barren = np.bincount(new_index, self.barren).astype(np.float64)
         self.edges = Edges()
         for row in range(old_edges.size):
             source, target = int(new_index[old_edges.source[row]]), int(new_index[old_edges.target[row]])
@@ -307,8 +297,8 @@ class SkillGraph:
             "events": [event.get_state() for event in self.events],
             "walks": list(self.walk_ids),
             "edges": self.edges.get_state(),
-            "visits": self.visits[: len(self.events)].copy(),
-            "barren": self.barren[: len(self.events)].copy(),
+            "visits": self.visits.copy(),
+            "barren": self.barren.copy(),
             "cover_radius": self.cover_radius,
             "now": self.now,
             "n_made": self.n_made,
@@ -317,12 +307,12 @@ class SkillGraph:
     def set_state(self, state: dict[str, Any]) -> None:
         """Restore what :meth:`get_state` returned."""
         self.events, self.walk_ids, self.edges = [], [], Edges()
+        self.centers = np.zeros((0, self.goal_dim))
         for spec in state["events"]:
             self.events[self.add_event(spec["center"], salient=spec["salient"])] = Event(**spec, metric=self.metric)
         self.walk_ids = list(state["walks"])
         self._index = self._build_index()
-        self.visits[: len(self.events)] = state["visits"]
-        self.barren[: len(self.events)] = state["barren"]
+        self.visits, self.barren = np.array(state["visits"]), np.array(state["barren"])
         self.edges.set_state(state["edges"])
         self.cover_radius, self.now, self.n_made = state["cover_radius"], state["now"], state["n_made"]
         self.version += 1

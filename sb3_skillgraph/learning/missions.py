@@ -236,7 +236,7 @@ class Missions(Agenda):
         n_events = len(self.graph.events)
         weight = np.ones(n_events)
         if chance < np.interp(n_events, (MANY_EVENTS, 2 * MANY_EVENTS), (0.0, FROM_FURTHER)):
-            weight = np.sqrt(1.0 + self.graph.barren[:n_events])
+            weight = np.sqrt(1.0 + self.graph.barren)
         return [int((weight * self.graph.distances(point)).argmin()) for point in points]
 
     def _beyond(self, event: int, point: np.ndarray, chance: float) -> Mission:
