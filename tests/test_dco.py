@@ -37,7 +37,7 @@ def test_it_is_the_fiedler_vector(width: int, height: int, walls: set[tuple[int,
     rng = np.random.default_rng(seed)
     cells, neighbours = grid(width, height, walls)
     steps = np.argwhere(neighbours)[rng.integers(0, neighbours.sum(), 5_000)]
-    embedding = FiedlerEmbedding().fit(cells[steps[:, 0]], cells[steps[:, 1]], rng)
+    embedding = FiedlerEmbedding(cells[steps[:, 0]], cells[steps[:, 1]], rng)
     values = embedding(cells)
     assert values.shape == (len(cells),)
     assert abs(spearmanr(values, fiedler(neighbours)).statistic) >= 0.95
@@ -45,20 +45,14 @@ def test_it_is_the_fiedler_vector(width: int, height: int, walls: set[tuple[int,
     assert 0.7 < values.std() < 1.2
 
 
-def test_it_leaves_torchs_generator_alone_and_repeats_itself() -> None:
+def test_it_leaves_torchs_generator_alone_and_repeats_itself(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(dco, "N_UPDATES", 20)
     cells, neighbours = grid(5, 3)
     steps = np.argwhere(neighbours)
     before = th.get_rng_state()
-    fits = [
-        FiedlerEmbedding(n_updates=20).fit(cells[steps[:, 0]], cells[steps[:, 1]], np.random.default_rng(3)) for _ in range(2)
-    ]
+    fits = [FiedlerEmbedding(cells[steps[:, 0]], cells[steps[:, 1]], np.random.default_rng(3)) for _ in range(2)]
     assert th.equal(th.get_rng_state(), before)
     np.testing.assert_array_equal(fits[0](cells), fits[1](cells))
-
-
-def test_it_says_when_it_has_learned_nothing() -> None:
-    with pytest.raises(ValueError, match="call fit first"):
-        FiedlerEmbedding()(np.zeros((1, 2)))
 
 
 def corridor(n_steps: int) -> TransitionStore:

@@ -1,6 +1,5 @@
 """Salient events by deep covering options: the two ends of the explored space (sections 2.3, 3.2.1, A.1)."""
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -11,6 +10,13 @@ from sb3_skillgraph.memory.store import TransitionStore
 
 #: Environment steps between two embeddings, each of which takes half a second to learn.
 LEARN_EVERY = 5_000
+#: Units of the network's hidden layers, and to which half side the explored box is scaled before the first sine: more follows
+#: thinner walls.
+NET_ARCH, FREQUENCY = [128, 128], 10.0
+#: Of its learning: Adam's rate at the beginning, which falls to 0; gradient steps; transitions in each.
+LEARNING_RATE, N_UPDATES, BATCH_SIZE = 1e-3, 1_000, 256
+#: Weight of the constraints on mean and variance.
+PENALTY = 1.0
 
 
 class Sine(th.nn.Module):
@@ -34,69 +40,37 @@ class FiedlerEmbedding:
     Across a wall the Fiedler vector jumps. The hidden units are sines, which can follow it there; ReLU and tanh networks
     find the smoother second-best vector instead.
 
-    :param net_arch: units of the hidden layers
-    :param frequency: to which half side the explored box is scaled before the first sine; more follows thinner walls
-    :param learning_rate: of Adam at the beginning; it falls to 0
-    :param n_updates: gradient steps per fit
-    :param batch_size: transitions per step
-    :param penalty: weight of the constraints on mean and variance
+    :param points: where the transitions begin that it is learned from, shape ``(n, goal_dim)``
+    :param successors: where they end, shape ``(n, goal_dim)``
+    :param rng: draws the initial weights and the minibatches
     """
 
-    def __init__(
-        self,
-        net_arch: Sequence[int] = (128, 128),
-        frequency: float = 10.0,
-        learning_rate: float = 1e-3,
-        n_updates: int = 1_000,
-        batch_size: int = 256,
-        penalty: float = 1.0,
-    ) -> None:
-        self.net_arch = list(net_arch)
-        self.frequency = frequency
-        self.learning_rate = learning_rate
-        self.n_updates = n_updates
-        self.batch_size = batch_size
-        self.penalty = penalty
-        self._net: th.nn.Module | None = None
-        self._center, self._scale = np.zeros(0), 1.0
-
-    def fit(self, points: np.ndarray, successors: np.ndarray, rng: np.random.Generator) -> "FiedlerEmbedding":
-        """Learn from transitions, from scratch.
-
-        :param points: where they begin, shape ``(n, goal_dim)``
-        :param successors: where they end, shape ``(n, goal_dim)``
-        :param rng: draws the initial weights and the minibatches
-        :return: the embedding itself
-        """
+    def __init__(self, points: np.ndarray, successors: np.ndarray, rng: np.random.Generator) -> None:
         self._center = points.mean(axis=0)
-        self._scale = self.frequency / (float(np.abs(points - self._center).max()) or 1.0)
+        self._scale = FREQUENCY / (float(np.abs(points - self._center).max()) or 1.0)
         with th.random.fork_rng(devices=[]):  # learning elsewhere must not depend on whether this was called
             th.manual_seed(int(rng.integers(2**31)))
-            self._net = th.nn.Sequential(*create_mlp(points.shape[1], 1, self.net_arch, Sine))
-        optimizer = th.optim.Adam(self._net.parameters(), lr=self.learning_rate, fused=True)
-        decay = th.optim.lr_scheduler.LinearLR(optimizer, 1.0, 0.0, self.n_updates)
+            self._net = th.nn.Sequential(*create_mlp(points.shape[1], 1, NET_ARCH, Sine))
+        optimizer = th.optim.Adam(self._net.parameters(), lr=LEARNING_RATE, fused=True)
+        decay = th.optim.lr_scheduler.LinearLR(optimizer, 1.0, 0.0, N_UPDATES)
         pairs = th.stack([self._input(points), self._input(successors)])
-        for rows in rng.integers(0, len(points), (self.n_updates, self.batch_size)):
+        for rows in rng.integers(0, len(points), (N_UPDATES, BATCH_SIZE)):
             f, f_next = self._net(pairs[:, rows])
             drawn = 0.5 * (f - f_next).pow(2).mean()
             # Two halves of the batch make the squares of expectations unbiased.
             (mean_a, mean_b), (square_a, square_b) = (x.view(2, -1).mean(dim=1) for x in (f, f.pow(2)))
-            loss = drawn + self.penalty * ((square_a - 1) * (square_b - 1) + 2 * mean_a * mean_b)
+            loss = drawn + PENALTY * ((square_a - 1) * (square_b - 1) + 2 * mean_a * mean_b)
             optimizer.zero_grad()
             loss.backward()
             optimizer.step()
             decay.step()
-        return self
 
     def __call__(self, points: np.ndarray) -> np.ndarray:
         """Evaluate the embedding.
 
         :param points: shape ``(n, goal_dim)``
         :return: shape ``(n,)``; its sign is arbitrary
-        :raises ValueError: before :meth:`fit`
         """
-        if self._net is None:
-            raise ValueError("The Fiedler embedding has learned nothing yet: call fit first.")
         with th.no_grad():
             return self._net(self._input(points)).numpy().ravel()
 
@@ -117,7 +91,7 @@ def learn_fiedler(store: TransitionStore, reach: int, n_pairs: int, rng: np.rand
     """
     rows = rng.integers(store.oldest, store.total, n_pairs)
     later = store.future(rows, reach, rng)
-    return FiedlerEmbedding().fit(store.column("achieved_goal", rows), store.column("next_achieved_goal", later), rng)
+    return FiedlerEmbedding(store.column("achieved_goal", rows), store.column("next_achieved_goal", later), rng)
 
 
 class DCOSalience:
