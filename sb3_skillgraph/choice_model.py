@@ -148,10 +148,15 @@ class ChoiceModel:
         found = (self.graph.edges.find(u, v) for u, v in zip(runs.source.tolist(), runs.target.tolist(), strict=True))
         replaced = np.unique(np.array([row for row in found if row is not None], dtype=np.int64))
         tried = self.walks().take(replaced)
-        for i, (source, target) in enumerate(zip(tried.source.tolist(), tried.target.tolist(), strict=True)):
-            for success, landing, number in runs.of(source, target):
-                tried.add_runs(i, success, landing, EPISODE_WEIGHT * number)
+        self._add_episode(tried, tried.source, runs)
         return replaced, tried
+
+    @staticmethod
+    def _add_episode(choices: Choices, events: np.ndarray, runs: Runs) -> None:
+        """Add the episode's runs to choices, in place; they are recorded for the events that these begin in."""
+        for i, (event, target) in enumerate(zip(events.tolist(), choices.target.tolist(), strict=True)):
+            for success, landing, number in runs.of(event, target):
+                choices.add_runs(i, success, landing, EPISODE_WEIGHT * number)
 
     def _edges(self, chosen: np.ndarray, replaced: np.ndarray, tried: Choices) -> Choices:
         """Return some of the graph's edges, with what the episode has shown of them."""
@@ -229,9 +234,7 @@ class ChoiceModel:
             steps=stretch * walks.steps,
             failed_steps=stretch * walks.failed_steps,
         )
-        for i, source in enumerate(beside.source.tolist()):
-            for success, where, number in runs.of(source, vertex):
-                beside.add_runs(i, success, where, EPISODE_WEIGHT * number)
+        self._add_episode(beside, beside.source, runs)
         return beside
 
     def _guessed(
@@ -271,9 +274,7 @@ class ChoiceModel:
             landing,
             np.zeros(landing.shape),
         )
-        for i, (in_event, to) in enumerate(zip(event.tolist(), targets.tolist(), strict=True)):
-            for success, where, number in runs.of(in_event, to):
-                guessed.add_runs(i, success, where, EPISODE_WEIGHT * number)
+        self._add_episode(guessed, event, runs)
         return guessed
 
     def _at_start(
