@@ -145,9 +145,7 @@ class Runner:
         if idle:
             state = state.copy()
         for i in idle:
-            chosen = (choose or self.choose)(state, i, points[i], goals[i], stance)
-            state.option[i], state.began[i], state.aim[i], state.timeout[i] = chosen
-            state.steps[i] = state.still[i] = 0
+            state.begin(i, *(choose or self.choose)(state, i, points[i], goals[i], stance))
         # All walks act by one network, in one pass for all environments; skills by their own
         seen = self.view(observation["observation"], points, state.aim)
         actions = self.walk(seen, state.failed)

@@ -124,6 +124,18 @@ class RunnerState(NamedTuple):
         stands = (change <= STILL * pace).all(axis=1) & (self.elapsed > 0)
         return self._replace(seen=seen, pace=pace, still=np.where(stands, self.still + 1, 0))
 
+    def begin(self, i: int, option: str, event: str, aim: np.ndarray, timeout: float) -> None:
+        """Begin an option, in place.
+
+        :param i: the environment
+        :param option: its id
+        :param event: id of the event it begins in, empty if in none
+        :param aim: where it walks to, shape ``(goal_dim,)``
+        :param timeout: environment steps it may run
+        """
+        self.option[i], self.began[i], self.aim[i], self.timeout[i] = option, event, aim, timeout
+        self.steps[i] = self.still[i] = 0
+
     def end(self, run: Run) -> None:
         """Write a run that has ended into the record of the episode, in place."""
         i = run.env

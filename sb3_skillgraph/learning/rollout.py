@@ -127,10 +127,8 @@ class Rollout:
         state = state.copy()
         for i in idle:
             mission = missions[i]
-            state.option[i] = DIRECT
-            state.began[i] = state.arrived[i]
-            state.aim[i] = mission.goal if mission.beyond is None else mission.beyond
-            state.steps[i], state.timeout[i], state.still[i] = 0, mission.explore_steps, 0
+            aim = mission.goal if mission.beyond is None else mission.beyond
+            state.begin(i, DIRECT, str(state.arrived[i]), aim, mission.explore_steps)
         return state
 
     def with_noise(
