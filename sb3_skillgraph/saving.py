@@ -158,13 +158,12 @@ def _decode(tree: Any, arrays: dict[str, np.ndarray], left: dict[str, int]) -> A
     return {key: _decode(value, arrays, left) for key, value in tree.items()}
 
 
-def save_tree(path: PathOrFile, kind: str, tree: dict[str, Any], suffix: str = ".zip", by_name: Collection[str] = ()) -> None:
+def save_tree(path: PathOrFile, kind: str, tree: dict[str, Any], by_name: Collection[str] = ()) -> None:
     """Write a tree; a file is written beside its place and then renamed, so that the old one stays until the new is whole.
 
-    :param path: path (``suffix`` is added if it has none) or binary file object
+    :param path: path (``.zip`` is added if it has none) or binary file object
     :param kind: what the file holds, checked on loading
     :param tree: the data
-    :param suffix: file name ending
     :param by_name: entries of the tree in which what is no plain data is stored by its name
     :raises ValueError: naming what is no plain data elsewhere: it could not be read again
     :raises OSError: if the file cannot be written; an old file of that name is then untouched
@@ -175,7 +174,7 @@ def save_tree(path: PathOrFile, kind: str, tree: dict[str, Any], suffix: str = "
         _write(path, document, encoder)
         return
     path = pathlib.Path(path)
-    path = path.with_name(path.name + suffix) if path.suffix == "" else path
+    path = path.with_name(path.name + ".zip") if path.suffix == "" else path
     with replaced(path) as file:
         _write(file, document, encoder)
 
@@ -189,19 +188,18 @@ def _write(file: Any, document: dict[str, Any], encoder: _Encoder) -> None:
                 np.lib.format.write_array(member, np.concatenate(parts, dtype=dtype), allow_pickle=False)
 
 
-def load_tree(path: PathOrFile, kind: str, suffix: str = ".zip") -> dict[str, Any]:
+def load_tree(path: PathOrFile, kind: str) -> dict[str, Any]:
     """Read a tree; nothing in the file is ever executed.
 
-    :param path: path (with or without ``suffix``) or binary file object
+    :param path: path (with or without ``.zip``) or binary file object
     :param kind: what the file must hold
-    :param suffix: file name ending
     :return: the data
     :raises FileNotFoundError: if there is no such file
     :raises ValueError: if the file is damaged, of another kind, or of another schema
     """
     if isinstance(path, str | pathlib.Path):
         given = pathlib.Path(path)
-        path = given if given.exists() else given.with_name(given.name + suffix)
+        path = given if given.exists() else given.with_name(given.name + ".zip")
         if not path.is_file():
             raise FileNotFoundError(f"There is no file {str(given)!r}, nor {str(path)!r}.")
     try:

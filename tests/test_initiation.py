@@ -45,12 +45,12 @@ def test_empty_before_the_first_fit() -> None:
     initiation.add_failure(np.zeros(2))
     assert not initiation.refit(force=True)  # failures alone describe no place
     initiation.add_success(path([0.0, 0.0], [1.0, 0.0]))
-    assert not initiation.is_fitted
+    assert not initiation.optimistic_boundaries
     assert not initiation.optimistic(grid()).any()
     assert not initiation.pessimistic(grid()).any()
     assert initiation.core is None
     assert initiation.refit()
-    assert initiation.is_fitted
+    assert initiation.optimistic_boundaries
     assert initiation.optimistic(grid()).any()
 
 

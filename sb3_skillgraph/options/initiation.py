@@ -57,11 +57,6 @@ class InitiationSet:
         self.core: np.ndarray | None = None
         self._n_news = 0
 
-    @property
-    def is_fitted(self) -> bool:
-        """Whether there is a set at all; an option without one starts nowhere but in its own gestation."""
-        return bool(self.optimistic_boundaries)
-
     def add_success(self, path: np.ndarray) -> None:
         """Remember the way of a successful run.
 

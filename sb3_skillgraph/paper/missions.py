@@ -61,7 +61,7 @@ class PaperMissions(Agenda):
     def prepare(self) -> None:
         """Do what there is to do between missions: look for new events, where it is time to, and open the chains due."""
         if self.pinned is not None:
-            self._pinned_event(self.pinned)
+            self._pin(self.pinned)
             return
         if self._is_due():
             self._attempt()
@@ -83,19 +83,17 @@ class PaperMissions(Agenda):
     def _event(self, id: str) -> Event:
         return self.graph.events[self.graph.index(id)]
 
-    def _pinned_event(self, goal: np.ndarray) -> Event:
-        """Return the event that few-shot adaptation is for; a new one gets its chain (section 3.3, cases b and c).
+    def _pin(self, goal: np.ndarray) -> None:
+        """Make the goal of few-shot adaptation an event, if it is none, with a chain to it (section 3.3, cases b and c).
 
         In case b its root starts where another option can.
         """
-        for event in self.graph.events:
-            if np.array_equal(event.center, goal):
-                return event
+        if any(np.array_equal(event.center, goal) for event in self.graph.events):
+            return
         around = self.graph.holding(goal)
         event = self._add(goal)
         if around:
             self.chaining.begin_inside(self.chaining.leading_to(event.id)[0], around[0])
-        return event
 
     # -- salient events -----------------------------------------------------------------------------------------------
 
