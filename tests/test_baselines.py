@@ -25,10 +25,10 @@ from sb3_skillgraph.baselines import (
     make_uvfa,
 )
 from sb3_skillgraph.baselines.covering_replay import TERMINATION_SHARE, LowEnd
+from sb3_skillgraph.memory.replay import OptionRule
 from sb3_skillgraph.metric import Ball
 from sb3_skillgraph.options.execution import Fate
 from sb3_skillgraph.options.learner import OptionTD3
-from sb3_skillgraph.options.option import goal_rule
 
 CORRIDOR = [[1] * 6, [1, "r", 0, 0, 0, 1], [1] * 6]
 SHORT_CORRIDOR: dict[str, Any] = {"maze_map": CORRIDOR, "max_steps": 60}
@@ -85,7 +85,7 @@ class Sinks(gym.Wrapper):
 
 
 def test_a_baseline_is_paid_as_options_are_paid() -> None:
-    task = OptionTask(Sinks(toy()), goal_rule(Ball(0.45), gamma=0.9, shaping=0.9))  # for each radius: 2 for each cell
+    task = OptionTask(Sinks(toy()), OptionRule(Ball(0.45), gamma=0.9, shaping=0.9))  # for each radius: 2 for each cell
     goal = np.array([1.0, 1.0])
     before = task.reset(seed=0, options={"start": [-1.0, 1.0], "goal": goal})[0]["achieved_goal"]
     for n_steps in (1, 2, 3):

@@ -16,7 +16,6 @@ from sb3_skillgraph.memory.replay import OptionReplay, OptionRule
 from sb3_skillgraph.memory.store import TransitionStore
 from sb3_skillgraph.metric import Ball
 from sb3_skillgraph.options.env import OptionEnv
-from sb3_skillgraph.options.option import goal_rule, termination_rule
 from sb3_skillgraph.options.views import ScaledView, relative_view
 
 CAPACITY = 12
@@ -252,7 +251,7 @@ def soon_stuck(store: TransitionStore) -> list[int]:
 @pytest.mark.parametrize(("hindsight", "shared"), [(0.0, 0.0), (0.8, 0.0), (0.8, 0.5), (1.0, 0.0), (0.0, 1.0)])
 def test_reward_and_end_follow_the_rule(hindsight: float, shared: float) -> None:
     store = walked_store()
-    replay = make_replay(store, termination_rule(EVENT, BALL), hindsight=hindsight, shared=shared)
+    replay = make_replay(store, OptionRule(BALL, termination=EVENT), hindsight=hindsight, shared=shared)
     replay.add_rows(np.arange(10, 50))
     imagined = check_relabelling(store, replay.sample(300), n_ending_in_event=300 - int(300 * shared))
     expected = shared + (1.0 - shared) * hindsight
@@ -261,7 +260,7 @@ def test_reward_and_end_follow_the_rule(hindsight: float, shared: float) -> None
 
 def test_the_global_options_rule_is_the_distance_to_its_goal() -> None:
     store = walked_store()
-    replay = make_replay(store, goal_rule(BALL), everything=True, hindsight=0.6)
+    replay = make_replay(store, OptionRule(BALL), hindsight=0.6)
     samples = replay.sample(1500)
     imagined = check_relabelling(store, samples, n_ending_in_event=0)
     assert abs(imagined.mean() - 0.6) < 0.06
@@ -280,7 +279,7 @@ def test_no_goal_is_put_in_shortly_before_the_agent_gets_stuck(n_envs: int, doom
         last = np.full(n_envs, t % n_steps == n_steps - 1)
         point, pursued = number.repeat(2, 1), np.full((n_envs, 2), 1e4)
         store.add(number, point, number, point, number, pursued, last, last, last & (t < n_steps))
-    replay = make_replay(store, goal_rule(BALL), everything=True, hindsight=1.0, doomed_steps=doomed_steps)
+    replay = make_replay(store, OptionRule(BALL), hindsight=1.0, doomed_steps=doomed_steps)
     samples = replay.sample(8000)
     kept = {int(row) for row, seen in zip(samples.actions[:, 0], samples.observations, strict=True) if seen[-1] == 1e4}
     assert kept == set(range(n_envs * (n_steps - min(doomed_steps, n_steps // 2)), n_envs * n_steps))
@@ -289,7 +288,7 @@ def test_no_goal_is_put_in_shortly_before_the_agent_gets_stuck(n_envs: int, doom
 def test_both_outcomes_occur_in_the_walks() -> None:
     """The relabelling tests above see successes, failures and ends of both kinds."""
     store = walked_store()
-    replay = make_replay(store, termination_rule(EVENT, BALL), hindsight=0.0, shared=0.0)
+    replay = make_replay(store, OptionRule(BALL, termination=EVENT), hindsight=0.0, shared=0.0)
     replay.add_rows(np.arange(0, 120))
     samples = replay.sample(1500)
     reached, done = samples.rewards.numpy() == 0.0, samples.dones.numpy() == 1.0
@@ -302,7 +301,7 @@ def test_both_outcomes_occur_in_the_walks() -> None:
 def test_shaping_changes_a_return_by_where_it_begins_alone(ending: str, gamma: float) -> None:
     """Whatever way is taken: so no policy is better or worse for it."""
     goal, n = np.array([3.0, -1.0]), 12
-    plain, shaped = goal_rule(BALL, gamma=gamma), goal_rule(BALL, gamma=gamma, shaping=2.0)
+    plain, shaped = OptionRule(BALL, gamma=gamma), OptionRule(BALL, gamma=gamma, shaping=2.0)
     for seed in range(3):
         points = np.concatenate([np.zeros((1, 2)), np.random.default_rng(seed).normal(size=(n, 2))])
         last = np.arange(n) == n - 1
@@ -316,15 +315,15 @@ def test_shaping_changes_a_return_by_where_it_begins_alone(ending: str, gamma: f
 def test_getting_stuck_costs_what_standing_there_forever_would() -> None:
     points, yes = np.zeros((1, 2)), np.ones(1, dtype=bool)
     for gamma in (0.9, 0.99):
-        reward = goal_rule(BALL, gamma=gamma).reward(~yes, yes, yes, points, points, points + 5.0)
+        reward = OptionRule(BALL, gamma=gamma).reward(~yes, yes, yes, points, points, points + 5.0)
         assert reward == pytest.approx(-sum(gamma**t for t in range(10_000)), rel=1e-4)
-    assert np.isfinite(goal_rule(BALL, gamma=1.0).reward(~yes, yes, yes, points, points, points)).all()
+    assert np.isfinite(OptionRule(BALL, gamma=1.0).reward(~yes, yes, yes, points, points, points)).all()
 
 
 @pytest.mark.parametrize("shared", [0.0, 0.25, 1.0])
 def test_a_share_of_every_batch_comes_from_the_whole_store(shared: float) -> None:
     store = walked_store(gets_stuck=False)
-    replay = make_replay(store, termination_rule(EVENT, BALL), hindsight=0.0, shared=shared)
+    replay = make_replay(store, OptionRule(BALL, termination=EVENT), hindsight=0.0, shared=shared)
     replay.add_rows(np.array([3, 7, 11]))
     samples = replay.sample(200)
     own = samples.observations.numpy()[:, -1] == 1e4  # own rows keep their goal here, shared ones never do
@@ -336,7 +335,7 @@ def test_a_share_of_every_batch_comes_from_the_whole_store(shared: float) -> Non
 
 def test_without_rows_of_its_own_an_option_learns_from_the_whole_store_in_hindsight() -> None:
     store = walked_store()
-    replay = make_replay(store, termination_rule(EVENT, BALL), hindsight=0.0, shared=0.5)
+    replay = make_replay(store, OptionRule(BALL, termination=EVENT), hindsight=0.0, shared=0.5)
     assert replay.size() == 0
     assert check_relabelling(store, replay.sample(100), n_ending_in_event=0).all()
 
@@ -345,7 +344,7 @@ def test_without_rows_of_its_own_an_option_learns_from_the_whole_store_in_hindsi
 @profile(30)
 def test_a_view_never_reads_an_overwritten_row(turns: list[int], everything: bool) -> None:
     store = SpyStore(20, OBSERVATION_DIM, 2, 1, 1)
-    replay = make_replay(store, termination_rule(EVENT, BALL), everything=everything, capacity=10)
+    replay = make_replay(store, OptionRule(BALL, termination=None if everything else EVENT), capacity=10)
     for k, n in enumerate(turns):
         for _ in range(n):
             number = np.full((1, 1), store.total, dtype=np.float32)
@@ -363,7 +362,7 @@ def test_a_view_never_reads_an_overwritten_row(turns: list[int], everything: boo
 
 def test_only_the_newest_own_rows_are_kept() -> None:
     store = walked_store(n_steps=100)
-    replay = make_replay(store, termination_rule(EVENT, BALL), hindsight=0.0, shared=0.0, capacity=20)
+    replay = make_replay(store, OptionRule(BALL, termination=EVENT), hindsight=0.0, shared=0.0, capacity=20)
     for row in range(0, 200, 2):
         replay.add_rows(np.array([row]))
     assert 10 <= replay.size() <= 20
@@ -373,9 +372,9 @@ def test_only_the_newest_own_rows_are_kept() -> None:
 
 def test_replay_state_round_trip() -> None:
     store = walked_store(capacity=60, n_steps=100)
-    replay = make_replay(store, termination_rule(EVENT, BALL))
+    replay = make_replay(store, OptionRule(BALL, termination=EVENT))
     replay.add_rows(np.arange(100, 180))
-    restored = make_replay(store, termination_rule(EVENT, BALL))
+    restored = make_replay(store, OptionRule(BALL, termination=EVENT))
     restored.set_state(copy.deepcopy(replay.get_state()))
     assert restored.size() == replay.size() == 40  # rows 140 to 179 can still be read
     for one, other in zip(replay.sample(64), restored.sample(64), strict=True):

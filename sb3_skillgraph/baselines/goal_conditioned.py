@@ -9,7 +9,6 @@ from stable_baselines3.common.noise import NormalActionNoise
 
 from sb3_skillgraph.goal_env import metric_of
 from sb3_skillgraph.memory.replay import OptionRule
-from sb3_skillgraph.options.option import goal_rule
 
 #: What the agent's own options learn with, for the sake of comparison; the discount is the paper's.
 SETTINGS: dict[str, Any] = dict(
@@ -150,7 +149,7 @@ def make_her(env: gym.Env, *, seed: int | None = None, **kwargs: Any) -> DDPG:
     if env.has_wrapper_attr("terminate_on_success"):
         metric = metric_of(env)
         assert metric is not None  # it tells by what it ends
-        env = OptionTask(env, goal_rule(metric))
+        env = OptionTask(env, OptionRule(metric))
     # HER samples complete episodes only, so that the first one must be over before learning starts.
     limit = env.spec.max_episode_steps if env.spec is not None else None
     first_episode = int(env.get_wrapper_attr("max_steps")) if env.has_wrapper_attr("max_steps") else limit or 1_000

@@ -10,8 +10,9 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
+from sb3_skillgraph.events import TerminationSet
 from sb3_skillgraph.memory.store import TransitionStore
-from sb3_skillgraph.metric import Ball, Metric
+from sb3_skillgraph.metric import Metric
 
 
 class OptionRule(NamedTuple):
@@ -19,20 +20,31 @@ class OptionRule(NamedTuple):
 
     Where the agent gets stuck it pays what standing there forever would.
 
-    ``reached(next_achieved_goal, goal, imagined)`` returns a bool array of shape ``(n,)``; ``imagined`` marks the
-    transitions whose goal was put in by hindsight, for which reaching means coming within the radius of that goal.
-
-    :param reached: tells which transitions reach the goal
+    :param metric: of goal space
+    :param tolerance: how near a goal counts as reached, in radii
     :param gamma: discount factor
     :param shaping: further reward for a radius of distance gained; it is the change of a potential (Ng et al., 1999),
         which changes no policy's rank
-    :param metric: of that distance
+    :param termination: the set it ends in; None for an option that is given its goal, and ends near it
     """
 
-    reached: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
+    metric: Metric
+    tolerance: float = 1.0
     gamma: float = 0.99
     shaping: float = 0.0
-    metric: Metric = Ball(1.0)
+    termination: TerminationSet | None = None
+
+    def reached(self, achieved_goal: np.ndarray, goal: np.ndarray, imagined: np.ndarray) -> np.ndarray:
+        """Tell which transitions reach the goal, bool array of shape ``(n,)``.
+
+        :param achieved_goal: where they end, shape ``(n, goal_dim)``
+        :param goal: same shape
+        :param imagined: whether the goal was put in by hindsight: then to reach it is to come near it in any case
+        """
+        hit = self.metric.distance(achieved_goal, goal) <= self.tolerance * self.metric.radius
+        if self.termination is not None:
+            hit[~imagined] = self.termination.contains(achieved_goal[~imagined])
+        return hit
 
     def reward(
         self,
@@ -73,7 +85,6 @@ class OptionReplay(ReplayBuffer):
     :param observation_space: flat space of what the policy sees
     :param action_space: action space of the environment
     :param rng: random generator for sampling
-    :param everything: whether all rows of the store count as the option's own (the global option)
     :param hindsight: share of own transitions that take an achieved goal
     :param shared: share of a batch that comes from the whole store
     :param horizon: steps ahead from which an achieved goal is drawn
@@ -92,7 +103,6 @@ class OptionReplay(ReplayBuffer):
         action_space: spaces.Box,
         rng: np.random.Generator,
         *,
-        everything: bool = False,
         hindsight: float = 0.8,
         shared: float = 0.5,
         horizon: int = 200,
@@ -107,7 +117,7 @@ class OptionReplay(ReplayBuffer):
         self.view = view
         self.rule = rule
         self.rng = rng
-        self.everything = everything
+        self.everything = rule.termination is None
         self.hindsight = hindsight
         self.shared = shared
         self.horizon = horizon

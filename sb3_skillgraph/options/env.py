@@ -7,9 +7,10 @@ import numpy as np
 from gymnasium import spaces
 
 from sb3_skillgraph.events import Event
+from sb3_skillgraph.memory.replay import OptionRule
 from sb3_skillgraph.options.execution import Fate, fate
 from sb3_skillgraph.options.initiation import InitiationSet
-from sb3_skillgraph.options.option import Option, termination_rule
+from sb3_skillgraph.options.option import Option
 from sb3_skillgraph.options.views import ScaledView, View, as_view
 from sb3_skillgraph.options.walk import Walk
 
@@ -68,7 +69,7 @@ class OptionEnv(gym.Wrapper):
         if option_view is None and env.has_wrapper_attr("option_view"):
             option_view = env.get_wrapper_attr("option_view")
         self.view = ScaledView(as_view(option_view), termination.metric)
-        self.rule = termination_rule(termination, termination.metric)
+        self.rule = OptionRule(termination.metric, termination=termination)
         dims = [int(np.prod(space[key].shape)) for key in ("observation", "achieved_goal")]  # type: ignore[arg-type]
         self.observation_space = spaces.Box(-np.inf, np.inf, (self.view.dim(*dims),), np.float32)
         self._last: dict[str, np.ndarray] | None = None

@@ -11,10 +11,10 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_skillgraph.events import TerminationSet
-from sb3_skillgraph.memory.replay import OptionReplay
+from sb3_skillgraph.memory.replay import OptionReplay, OptionRule
 from sb3_skillgraph.memory.store import TransitionStore
 from sb3_skillgraph.metric import Metric
-from sb3_skillgraph.options.option import Option, goal_rule, termination_rule
+from sb3_skillgraph.options.option import Option
 from sb3_skillgraph.options.parameters import parameters, set_parameters
 from sb3_skillgraph.options.views import ScaledView
 
@@ -77,12 +77,7 @@ class OptionFactory:
         :param termination: the set it ends in; None for the global option
         :return: the option, gestating
         """
-        everything = termination is None
-        pay = dict(gamma=self.option_kwargs.get("gamma", 0.99), shaping=self.shaping)
-        if termination is None:
-            rule = goal_rule(self.metric, self.tolerance, **pay)
-        else:
-            rule = termination_rule(termination, self.metric, self.tolerance, **pay)
+        rule = OptionRule(self.metric, self.tolerance, self.option_kwargs.get("gamma", 0.99), self.shaping, termination)
         replay = OptionReplay(
             self.store,
             self.view,
@@ -90,7 +85,6 @@ class OptionFactory:
             self.observation_space,
             self.action_space,
             self.rng,
-            everything=everything,
             capacity=self.store.capacity,
             device=self.device,
             **self.replay_kwargs,

@@ -8,7 +8,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 
 from sb3_skillgraph.events import TerminationSet
-from sb3_skillgraph.memory.replay import OptionReplay, OptionRule
+from sb3_skillgraph.memory.replay import OptionReplay
 from sb3_skillgraph.metric import Metric
 from sb3_skillgraph.options.initiation import InitiationSet
 from sb3_skillgraph.options.numpy_actor import NumpyActor
@@ -160,41 +160,3 @@ class Option:
         self.effects = deque(state["effects"], maxlen=EFFECTS_LENGTH)
         self.initiation.set_state(state["initiation"])
         self.learner._n_updates = state["n_updates"]
-
-
-def goal_rule(metric: Metric, tolerance: float = 1.0, gamma: float = 0.99, shaping: float = 0.0) -> OptionRule:
-    """Return the rule of an option that is given its goal: it ends near it.
-
-    :param metric: of goal space
-    :param tolerance: how near, in radii
-    :param gamma: see :class:`~sb3_skillgraph.memory.replay.OptionRule`
-    :param shaping: likewise
-    :return: the rule of the global option, and of every transition relabelled in hindsight
-    """
-
-    def reached(achieved_goal: np.ndarray, goal: np.ndarray, imagined: np.ndarray) -> np.ndarray:
-        return metric.distance(achieved_goal, goal) <= tolerance * metric.radius
-
-    return OptionRule(reached, gamma, shaping, metric)
-
-
-def termination_rule(
-    termination: TerminationSet, metric: Metric, tolerance: float = 1.0, gamma: float = 0.99, shaping: float = 0.0
-) -> OptionRule:
-    """Return the rule of an option with a termination set of its own.
-
-    :param termination: where the option ends
-    :param metric: of goal space
-    :param tolerance: how near a goal that was put in by hindsight counts as reached, in radii
-    :param gamma: see :class:`~sb3_skillgraph.memory.replay.OptionRule`
-    :param shaping: likewise
-    :return: the rule
-    """
-    near_goal = goal_rule(metric, tolerance)
-
-    def reached(achieved_goal: np.ndarray, goal: np.ndarray, imagined: np.ndarray) -> np.ndarray:
-        hit = near_goal.reached(achieved_goal, goal, imagined)
-        hit[~imagined] = termination.contains(achieved_goal[~imagined])
-        return hit
-
-    return OptionRule(reached, gamma, shaping, metric)
