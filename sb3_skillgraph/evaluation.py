@@ -15,6 +15,9 @@ from sb3_skillgraph.goal_env import metric_of
 from sb3_skillgraph.hyperparams import make_recommended
 from sb3_skillgraph.planning import DIRECT
 
+#: Length of the shortest free path between start and goal, in cells, at least.
+MIN_CELLS = 2.0
+
 
 class NoPairsError(ValueError):
     """There is nothing to draw pairs of start and goal from."""
@@ -154,31 +157,26 @@ def brier_score(promises: Sequence[tuple[float, bool]]) -> float:
     return float(np.mean([(promised - success) ** 2 for promised, success in promises]))
 
 
-def sample_pairs(
-    geometry: MazeGeometry, margin: float, n_pairs: int, seed: int, min_cells: float = 2.0
-) -> list[tuple[np.ndarray, np.ndarray, float]]:
+def sample_pairs(geometry: MazeGeometry, margin: float, n_pairs: int, seed: int) -> list[tuple[np.ndarray, np.ndarray, float]]:
     """Draw starts and goals uniformly over the free area, redrawn until their shortest free path is long enough.
 
     :param geometry: the maze
     :param margin: distance kept from walls, in world units
     :param n_pairs: how many
     :param seed: seed
-    :param min_cells: shortest path at least, in cells
     :return: start, goal, and path length in cells
     :raises NoPairsError: if no such pairs are found, the maze being too small
     """
     rng = np.random.default_rng(seed)
     pairs: list[tuple[np.ndarray, np.ndarray, float]] = []
     for _ in range(1000 * n_pairs):
-        if len(pairs) == n_pairs:
-            return pairs
         start, goal = geometry.sample_free(rng, margin), geometry.sample_free(rng, margin)
         cells = geometry.shortest_path_length(start, goal) / geometry.cell_size
-        if min_cells <= cells < np.inf:
+        if MIN_CELLS <= cells < np.inf:
             pairs.append((start, goal, cells))
-    if len(pairs) == n_pairs:
-        return pairs
-    raise NoPairsError(f"The maze is too small: no {n_pairs} pairs of points {min_cells} cells apart were found.")
+        if len(pairs) == n_pairs:
+            return pairs
+    raise NoPairsError(f"The maze is too small: no {n_pairs} pairs of points {MIN_CELLS} cells apart were found.")
 
 
 def evaluate_pairs(
