@@ -5,14 +5,16 @@ import numpy as np
 import pytest
 import torch as th
 from builders import make_factory, profile
+from conftest import differences
 from gymnasium import spaces
 from hypothesis import given
 from hypothesis import strategies as st
+from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
 from sb3_skillgraph.envs import ToyMazeEnv
 from sb3_skillgraph.events import Event
-from sb3_skillgraph.memory.replay import OptionReplay, OptionRule
+from sb3_skillgraph.memory.replay import OptionReplay, OptionRule, draw
 from sb3_skillgraph.memory.store import TransitionStore
 from sb3_skillgraph.metric import Ball
 from sb3_skillgraph.options.env import OptionEnv
@@ -422,3 +424,34 @@ def test_option_env_and_view_agree_on_the_same_transitions() -> None:
         assert bool(samples.dones[i, 0]) == terminated
         np.testing.assert_allclose(samples.next_observations[i], following, atol=1e-5)
     assert {row for row, reward in enumerate(rewards) if reward == 0.0} & seen
+
+
+@pytest.mark.parametrize("n_steps", [7, 70], ids=["filling", "full"])
+@pytest.mark.parametrize("n_envs", [1, 3])
+@pytest.mark.parametrize("kind", ["plain", "thrifty", "n steps", "option"])
+def test_what_is_drawn_as_arrays_is_what_sample_returns(kind: str, n_envs: int, n_steps: int) -> None:
+    buffer: ReplayBuffer
+    if kind == "option":
+        buffer = make_replay(walked_store(n_steps=n_steps, n_envs=n_envs), OptionRule(BALL))
+    else:
+        rng, thrifty = np.random.default_rng(0), kind == "thrifty"
+        spec = 60, spaces.Box(-1, 1, (2, 2)), spaces.Box(-1, 1, (3,)), "cpu", n_envs, thrifty
+        if kind == "n steps":
+            buffer = NStepReplayBuffer(*spec, n_steps=3)
+        else:
+            buffer = ReplayBuffer(*spec, handle_timeout_termination=not thrifty)
+        for _ in range(n_steps):
+            seen, following = rng.normal(size=(2, n_envs, 2, 2))
+            action, reward, done = rng.normal(size=(n_envs, 3)), rng.normal(size=n_envs), rng.random(n_envs) < 0.3
+            buffer.add(seen, following, action, reward, done, [{"TimeLimit.truncated": bool(i % 2)} for i in range(n_envs)])
+    twin = copy.deepcopy(buffer)
+    before = np.random.get_state()  # noqa: NPY002
+    samples = buffer.sample(20)
+    after = np.random.get_state()  # noqa: NPY002
+    np.random.set_state(before)  # noqa: NPY002
+    arrays = draw(twin, 20, None)
+    for ours, theirs in zip(arrays, samples, strict=True):
+        assert (ours is None) == (theirs is None)
+        if ours is not None and theirs is not None:
+            np.testing.assert_array_equal(ours, theirs.numpy())
+    assert differences(after, np.random.get_state()) == []  # noqa: NPY002

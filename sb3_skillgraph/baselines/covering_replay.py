@@ -1,12 +1,9 @@
 """What a deep covering option leads to, where it starts, and what it learns from (section 2.3)."""
 
-from typing import Any
-
 import numpy as np
-from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
 from sb3_skillgraph.learning.dco import FiedlerEmbedding
-from sb3_skillgraph.memory.replay import OptionReplay
+from sb3_skillgraph.memory.replay import Minibatch, OptionReplay
 from sb3_skillgraph.options.initiation import InitiationSet
 
 TERMINATION_SHARE = 0.05  # of the states seen, those with the lowest values are where an option ends
@@ -62,12 +59,10 @@ class CoveringReplay(OptionReplay):
     end: LowEnd
     scale: float
 
-    def sample(self, batch_size: int, env: Any = None) -> ReplayBufferSamples:
+    def minibatch(self, batch_size: int) -> Minibatch:
         """Draw relabelled transitions.
 
         :param batch_size: number of transitions
-        :param env: not used
-        :return: tensors of shape ``(batch_size, ...)``
         """
         rows = self.rng.integers(self.store.oldest, self.store.total, batch_size)
         data = self.store.read(rows)
@@ -78,10 +73,10 @@ class CoveringReplay(OptionReplay):
         # Where the task's own goal ended an episode an option would have gone on.
         done = (after <= self.end.threshold) | stuck | self.store.terminated(rows)
         pay = self.rule.reward(there_already, done, stuck, here, there, goal) + (before - after) / self.scale
-        return ReplayBufferSamples(
-            observations=self._tensor(self.view(data["observation"], here, goal)),
-            actions=self._tensor(data["action"]),
-            next_observations=self._tensor(self.view(data["next_observation"], there, goal)),
-            dones=self._tensor(done.astype(np.float32)[:, None]),
-            rewards=self._tensor(pay.astype(np.float32)[:, None]),
+        return Minibatch(
+            observations=self.view(data["observation"], here, goal),
+            actions=data["action"],
+            next_observations=self.view(data["next_observation"], there, goal),
+            dones=done.astype(np.float32)[:, None],
+            rewards=pay.astype(np.float32)[:, None],
         )

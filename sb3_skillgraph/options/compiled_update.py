@@ -14,11 +14,11 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.policies import ContinuousCritic
 from stable_baselines3.common.torch_layers import FlattenExtractor
-from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.td3.policies import Actor, TD3Policy
 from stable_baselines3.td3.td3 import TD3
 from torch import nn
 
+from sb3_skillgraph.memory.replay import Minibatch
 from sb3_skillgraph.options.numpy_actor import is_plain, plain_linears
 
 if TYPE_CHECKING:
@@ -71,9 +71,9 @@ class CompiledUpdate:
         tensors = [*self._parameters, *(moment for state in states for moment in state.values())]
         options = [optimizer.param_groups[0].get(name) for optimizer in self._optimizers for name in ADAM_OPTIONS]
         learning = [parameter.requires_grad for parameter in self._parameters]
-        return [options, learning, [tensor.data_ptr() for tensor in tensors], [tensor.stride() for tensor in tensors]]
+        return [options, learning, [tensor.data_ptr() for tensor in tensors], [tensor.is_contiguous() for tensor in tensors]]
 
-    def update(self, data: ReplayBufferSamples, model: TD3, penalty: float, with_actor: bool) -> tuple[float, float]:
+    def update(self, data: Minibatch, model: TD3, penalty: float, with_actor: bool) -> tuple[float, float]:
         """
         Do one update.
 
@@ -84,14 +84,14 @@ class CompiledUpdate:
         :return: the critics' loss and the actor's (NaN without the actor)
         """
         # Drawn even where it is clipped to nothing (DDPG), so that torch's generator ends where SB3 leaves it.
-        noise, n = th.empty_like(data.actions).normal_(0, model.target_policy_noise), len(data.actions)
-        # What else there is to work out is a few numbers, for which torch's calls take longer than NumPy's
+        n = len(data.actions)
+        noise = th.empty(n, self._n_actions).normal_(0, model.target_policy_noise)
         discounts = np.float32(model.gamma) if data.discounts is None else _rows(data.discounts, n, 1)
         batch = (
             _rows(data.observations, n, self._n_observations),
             _rows(data.actions, n, self._n_actions),
             _rows(data.next_observations, n, self._n_observations),
-            _rows(noise, n, self._n_actions).clip(-model.target_noise_clip, model.target_noise_clip),
+            noise.numpy().clip(-model.target_noise_clip, model.target_noise_clip),
             _rows(data.rewards, n, 1),
             (np.float32(1) - _rows(data.dones, n, 1)) * discounts,
         )
@@ -191,6 +191,6 @@ def _array(name: str, tensor: th.Tensor, shape: tuple[int, ...]) -> np.ndarray:
     return np.atleast_2d(tensor.detach().numpy())
 
 
-def _rows(tensor: th.Tensor, n_rows: int, width: int) -> np.ndarray:
+def _rows(array: np.ndarray, n_rows: int, width: int) -> np.ndarray:
     """Return a part of a minibatch, of which there must be as much as the networks and the other parts expect."""
-    return np.ascontiguousarray(tensor.numpy(), np.float32).reshape(n_rows, width)
+    return np.ascontiguousarray(array, np.float32).reshape(n_rows, width)

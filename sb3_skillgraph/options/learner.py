@@ -19,6 +19,7 @@ from stable_baselines3.td3.td3 import TD3
 from torch import nn
 from torch.nn import functional as F
 
+from sb3_skillgraph.memory.replay import draw
 from sb3_skillgraph.options.compiled_update import CompiledUpdate, why_not
 
 
@@ -103,13 +104,14 @@ class OptionLearner(TD3):
         with flushed_denormals():
             for _ in range(gradient_steps):
                 self._n_updates += 1
-                replay_data = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
                 # The actor, and all targets with it, move less often than the critics
                 with_actor = self._n_updates % self.policy_delay == 0
                 if compiled is None:
+                    replay_data = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
                     critic_loss, actor_loss = self._update_by_torch(replay_data, with_actor)
                 else:
-                    critic_loss, actor_loss = compiled.update(replay_data, self, self.saturation_penalty, with_actor)
+                    data = draw(self.replay_buffer, batch_size, self._vec_normalize_env)
+                    critic_loss, actor_loss = compiled.update(data, self, self.saturation_penalty, with_actor)
                 critic_losses.append(critic_loss)
                 if with_actor:
                     actor_losses.append(actor_loss)
