@@ -45,12 +45,10 @@ class CompiledUpdate:
         self._optimizers = _optimizers(policy)
         _create_moments(self._optimizers)
         sizes = self._n_observations, self._n_actions
-        self._actor = _arrays("the actor", policy.actor.mu, policy.actor_target.mu, self._optimizers[0], sizes)
+        self._actor = _places("the actor", policy.actor.mu, policy.actor_target.mu, self._optimizers[0], sizes)
         sizes = self._n_observations + self._n_actions, 1
-        self._critics = tuple(
-            _arrays(f"critic {i}", network, target, self._optimizers[1], sizes)
-            for i, (network, target) in enumerate(zip(policy.critic.q_networks, policy.critic_target.q_networks, strict=True))
-        )
+        pairs = enumerate(zip(policy.critic.q_networks, policy.critic_target.q_networks, strict=True))
+        self._critics = np.stack([_places(f"critic {i}", *pair, self._optimizers[1], sizes) for i, pair in pairs])
         self._parameters = list(policy.parameters())
         self._layout = self._find_layout()
 
@@ -153,10 +151,10 @@ def _rates(optimizer: th.optim.Optimizer, tau: float) -> "kernel.Rates":
     return float(group["lr"]), float(beta1), float(beta2), float(group["eps"]), float(tau)
 
 
-def _arrays(
+def _places(
     name: str, network: nn.Module, target: nn.Module, optimizer: th.optim.Optimizer, sizes: tuple[int, int]
-) -> "kernel.Arrays":
-    """Return the memory of a network, of its target and of its moments, if all of it is as the numbers in and out ask."""
+) -> "kernel.Places":
+    """Return where a network, its target and its moments are, if all of it is as the numbers in and out ask."""
     shapes = _shapes(network, *sizes)
     states = [optimizer.state[parameter] for parameter in network.parameters()]
     kinds = ("exp_avg", "exp_avg_sq", "step")
@@ -164,13 +162,14 @@ def _arrays(
         raise ValueError(f"The optimiser of {name} has a parameter without one of {', '.join(kinds)}.")
     tensors = {"value": list(network.parameters()), "target": list(target.parameters())}
     tensors |= {kind: [state[kind] for state in states] for kind in kinds}
-    return tuple(
-        tuple(
-            _array(f"{kind} of parameter {i} of {name}", tensor, () if kind == "step" else shape)
+    places = [
+        [
+            _place(f"{kind} of parameter {i} of {name}", tensor, () if kind == "step" else shape)
             for i, (tensor, shape) in enumerate(zip(tensors[kind], shapes, strict=True))
-        )
+        ]
         for kind in tensors
-    )
+    ]
+    return np.array(places, dtype=np.int64)
 
 
 def _shapes(network: nn.Module, n_inputs: int, n_outputs: int) -> list[tuple[int, ...]]:
@@ -182,13 +181,14 @@ def _shapes(network: nn.Module, n_inputs: int, n_outputs: int) -> list[tuple[int
     return shapes
 
 
-def _array(name: str, tensor: th.Tensor, shape: tuple[int, ...]) -> np.ndarray:
-    """Return a tensor's memory in two dimensions; compiled code looks at no shape before it writes."""
+def _place(name: str, tensor: th.Tensor, shape: tuple[int, ...]) -> tuple[int, int, int]:
+    """Return where a tensor is, in two dimensions; compiled code looks at no shape before it writes."""
     if tensor.shape != shape:
         raise ValueError(f"The {name} has the shape {tuple(tensor.shape)}, not {shape}.")
     if tensor.dtype != th.float32 or tensor.device.type != "cpu" or not tensor.is_contiguous():
         raise ValueError(f"The {name} is not contiguous float32 in the CPU's memory.")
-    return np.atleast_2d(tensor.detach().numpy())
+    rows, columns = (1, 1, *shape)[-2:]
+    return tensor.data_ptr(), rows, columns
 
 
 def _rows(array: np.ndarray, n_rows: int, width: int) -> np.ndarray:

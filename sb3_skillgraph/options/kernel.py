@@ -11,11 +11,12 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numba import njit
+from numba import carray, njit, types
+from numba.extending import intrinsic
 
 Network = list[np.ndarray]  # weight (out, in) and bias (1, out) of each layer
 Learner = list[Network]  # a network, its target, both moments of Adam, its numbers of steps
-Arrays = tuple[tuple[np.ndarray, ...], ...]  # a learner in the form that numba takes from Python
+Places = np.ndarray  # of a learner's arrays in memory: address, rows and columns, (5, parameters, 3) whole numbers
 Rates = tuple[float, float, float, float, float]  # Adam's learning rate, betas and epsilon; tau, 0 for no target to move
 # Observations, actions, next observations, noise on next actions, rewards, discounts (0 after an end): (batch, width).
 Batch = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
@@ -246,20 +247,37 @@ def update_actor(observations: np.ndarray, actor: Learner, critic: Network, pena
     return loss
 
 
+@intrinsic
+def pointer(typing_context: Any, address: Any) -> Any:
+    """
+    Compiled code calls this with an address: numba has no such function of its own.
+
+    :param address: where a number is
+    :return: the pointer to it
+    """
+    signature = types.CPointer(types.float32)(address)
+
+    def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.inttoptr(arguments[0], context.get_value_type(signature.return_type))
+
+    return signature, code
+
+
 @inner
-def as_lists(arrays: Arrays) -> Learner:
+def learner_at(places: Places) -> Learner:
     """
-    :param arrays: a learner
-    :return: the same in lists, whose type does not depend on their length: less to compile for another network
+    :param places: where the arrays of a learner are; nothing in here looks whether they are
+    :return: the arrays, as they are
     """
-    return [[array for array in network] for network in arrays]
+    # Handed over as arrays each would have to be unpacked, and every number of them be compiled for anew.
+    return [[carray(pointer(place[0]), (place[1], place[2])) for place in network] for network in places]  # type: ignore[call-arg]
 
 
 @compiled
 def update(
     batch: Batch,
-    actor: Arrays,
-    critics: tuple[Arrays, ...],
+    actor: Places,
+    critics: np.ndarray,
     actor_rates: Rates,
     critic_rates: Rates,
     penalty: float,
@@ -270,15 +288,15 @@ def update(
 
     :param batch: what they learn from
     :param actor: the actor
-    :param critics: one or more
+    :param critics: one or more, (critics, 5, parameters, 3)
     :param actor_rates: of the actor
     :param critic_rates: of the critics
     :param penalty: see ``update_actor``
     :param with_actor: whether the actor learns, too
     :return: the critics' loss and the actor's (NaN without the actor)
     """
-    actor_learner = as_lists(actor)
-    critic_learners = [as_lists(critic) for critic in critics]
+    actor_learner = learner_at(actor)
+    critic_learners = [learner_at(critic) for critic in critics]
     critic_loss = update_critics(batch, actor_learner[1], critic_learners, critic_rates)
     if not with_actor:
         return critic_loss, math.nan
