@@ -1,6 +1,7 @@
 """The compiled update is held to the reference, and to what torch keeps."""
 
 import copy
+import ctypes
 
 import numpy as np
 import pytest
@@ -330,3 +331,36 @@ def test_a_moment_that_is_missing_is_named():
     model._compiled = None
     with pytest.raises(ValueError, match="critic 0 has a parameter without one of exp_avg"):
         train(model, 1)
+
+
+@kernel.compiled
+def multiply(left, right, left_turned, right_turned):
+    return kernel.product(left, right, left_turned, right_turned)
+
+
+@pytest.mark.parametrize("left_turned", [False, True])
+@pytest.mark.parametrize("right_turned", [False, True])
+def test_products(left_turned, right_turned):
+    rng = np.random.default_rng(0)
+    for m, k, n in ((1, 1, 1), (2, 3, 4), (64, 27, 1), (7, 130, 33)):
+        left, right = rng.normal(size=(m, k)).astype(np.float32), rng.normal(size=(k, n)).astype(np.float32)
+        given = [np.ascontiguousarray(x.T) if turned else x for x, turned in ((left, left_turned), (right, right_turned))]
+        result = multiply(*given, left_turned, right_turned)
+        assert result.dtype == np.float32
+        np.testing.assert_allclose(result, left @ right, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("whose", ["torch", "scipy"])
+def test_whoever_multiplies(whose, monkeypatch):
+    def none_such(path):
+        raise OSError(path)
+
+    if whose == "scipy":
+        monkeypatch.setattr(kernel.ctypes, "CDLL", none_such)
+    pointer = ctypes.c_void_p
+    sgemm = ctypes.CFUNCTYPE(None, *[pointer] * 13)(kernel.find_sgemm())
+    left, right, result = np.array([[1, 2], [3, 4]], "f"), np.array([[5, 6], [7, 8]], "f"), np.zeros((2, 2), "f")
+    letters, size, factors = np.frombuffer(b"NN", np.uint8), np.array([2], np.int64), np.array([1, 0], "f")
+    at = [x.ctypes.data for x in (letters, size, factors, right, left, result)]
+    sgemm(at[0], at[0], at[1], at[1], at[1], at[2], at[3], at[1], at[4], at[1], at[2] + 4, at[5], at[1])
+    np.testing.assert_array_equal(result, left @ right)

@@ -2,17 +2,20 @@
 The update of DDPG and TD3 in one compiled function, for networks of Linear and ReLU layers on a CPU.
 
 The numbers are those of ``OptionLearner._update_by_torch``, which is the one to read first. BLAS does the matrix
-products (``np.dot``) and loops do all else: what belongs to a layer is touched while it is in the cache, and loops are
-compiled in less time than expressions of arrays.
+products, torch's own where it can be found, and loops do all else: what belongs to a layer is touched while it is in the
+cache, and loops are compiled in less time than expressions of arrays.
 """
 
+import ctypes
 import math
 from collections.abc import Callable
 from typing import Any
 
+import llvmlite.binding
 import numpy as np
+import torch as th
 from numba import carray, njit, types
-from numba.extending import intrinsic
+from numba.extending import get_cython_function_address, intrinsic
 
 Network = list[np.ndarray]  # weight (out, in) and bias (1, out) of each layer
 Learner = list[Network]  # a network, its target, both moments of Adam, its numbers of steps
@@ -48,6 +51,63 @@ def inner(function: Callable[..., Any]) -> Callable[..., Any]:
     return compiled(function, no_cpython_wrapper=True)
 
 
+def find_sgemm() -> int:
+    """
+    :return: address of BLAS's product of matrices: torch's (at these sizes Intel's, which it has on x86, takes two thirds of
+        the time), else SciPy's
+    """
+    try:
+        address = ctypes.cast(ctypes.CDLL(th._C.__file__).sgemm_, ctypes.c_void_p).value
+    except (AttributeError, OSError):
+        address = None
+    return address or get_cython_function_address("scipy.linalg.cython_blas", "sgemm")
+
+
+_TEXT, _WHOLE, _FLOAT = (types.CPointer(kind) for kind in (types.uint8, types.int64, types.float32))
+_NAME = "sb3_skillgraph_sgemm"  # by which compiled code on disk finds it again
+llvmlite.binding.add_symbol(_NAME, find_sgemm())
+# Whether to transpose; sizes; a factor; matrices with the lengths of their rows; another factor; the result, likewise
+_sgemm: Any = types.ExternalFunction(
+    _NAME,
+    types.void(_TEXT, _TEXT, _WHOLE, _WHOLE, _WHOLE, _FLOAT, _FLOAT, _WHOLE, _FLOAT, _WHOLE, _FLOAT, _FLOAT, _WHOLE),
+)
+
+
+@inner
+def product(left: np.ndarray, right: np.ndarray, left_turned: bool, right_turned: bool) -> np.ndarray:
+    """
+    :param left: (m, k), or (k, m) if it is to be transposed
+    :param right: (k, n), or (n, k) if it is to be transposed
+    :param left_turned: whether it is
+    :param right_turned: whether it is
+    :return: (m, n)
+    """
+    m, k = (left.shape[1], left.shape[0]) if left_turned else left.shape
+    n = right.shape[0] if right_turned else right.shape[1]
+    result = np.empty((m, n), np.float32)
+    # BLAS goes by columns, and sees every matrix transposed: the right one comes first. Whole numbers of 64 bits are read
+    # right by one that expects 32, too, where the low ones come first.
+    turn = np.array([ord("T") if right_turned else ord("N"), ord("T") if left_turned else ord("N")], np.uint8)
+    sizes = np.array([n, m, k, right.shape[1], left.shape[1]], np.int64)
+    factors = np.array([1.0, 0.0], np.float32)
+    _sgemm(
+        turn.ctypes,
+        turn[1:].ctypes,
+        sizes.ctypes,
+        sizes[1:].ctypes,
+        sizes[2:].ctypes,
+        factors.ctypes,
+        right.ctypes,
+        sizes[3:].ctypes,
+        left.ctypes,
+        sizes[4:].ctypes,
+        factors[1:].ctypes,
+        result.ctypes,
+        sizes.ctypes,
+    )
+    return result
+
+
 @inner
 def forward(network: Network, inputs: np.ndarray) -> list[np.ndarray]:
     """
@@ -59,7 +119,7 @@ def forward(network: Network, inputs: np.ndarray) -> list[np.ndarray]:
     for k in range(0, len(network), 2):
         weight, bias = network[k], network[k + 1]
         is_last = k == len(network) - 2
-        outputs = np.dot(values[-1], weight.T)
+        outputs = product(values[-1], weight, False, True)
         for i in range(outputs.shape[0]):
             for j in range(outputs.shape[1]):
                 outputs[i, j] += bias[0, j]
@@ -77,7 +137,7 @@ def back_to_relu(gradient: np.ndarray, weight: np.ndarray, inputs: np.ndarray) -
     :param inputs: (batch, in), what a ReLU gave the layer
     :return: (batch, in), of the loss by what the ReLU was given
     """
-    result = np.dot(gradient, weight)
+    result = product(gradient, weight, False, False)
     for i in range(result.shape[0]):
         for j in range(result.shape[1]):
             if inputs[i, j] <= 0:
@@ -153,7 +213,7 @@ def backward(learner: Learner, values: list[np.ndarray], gradient: np.ndarray, r
     :param rates: of Adam and of the target
     """
     for layer in range(len(values) - 2, -1, -1):
-        weight_gradient = np.dot(gradient.T, values[layer])
+        weight_gradient = product(gradient, values[layer], True, False)
         bias_gradient = column_sums(gradient)
         if layer > 0:
             # Before the weight learns: the gradient is that of the weight in use.
@@ -236,7 +296,7 @@ def update_actor(observations: np.ndarray, actor: Learner, critic: Network, pena
         gradient[i, 0] = np.float32(-1 / n)
     for layer in range(len(critic_values) - 2, 0, -1):
         gradient = back_to_relu(gradient, critic[2 * layer], critic_values[layer])
-    by_inputs = np.dot(gradient, critic[0])
+    by_inputs = product(gradient, critic[0], False, False)
     # Go back through the tanh, before which the penalty comes in.
     by_actions = np.empty_like(actions)
     for i in range(n):
