@@ -10,7 +10,8 @@ from gymnasium import spaces
 from learners import by_torch, distance, fill, make, same, train
 from stable_baselines3.common.buffers import ReplayBuffer
 
-from sb3_skillgraph.options import kernel
+from sb3_skillgraph.options import blas
+from sb3_skillgraph.options.compiling import compiled
 from sb3_skillgraph.options.learner import OptionDDPG, OptionTD3
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -297,7 +298,7 @@ def test_the_same_bits_however_often_it_is_copied():
 def test_what_has_no_place_on_disk_is_compiled_all_the_same():
     namespace = {}
     exec("def twice(x): return 2 * x", namespace)  # numba finds no file to keep the result beside
-    assert kernel.compiled(namespace["twice"])(4) == 8
+    assert compiled(namespace["twice"])(4) == 8
 
 
 def test_what_changes_at_the_networks_after_an_update_is_followed():
@@ -333,9 +334,9 @@ def test_a_moment_that_is_missing_is_named():
         train(model, 1)
 
 
-@kernel.compiled
+@compiled
 def multiply(left, right, left_turned, right_turned):
-    return kernel.product(left, right, left_turned, right_turned)
+    return blas.product(left, right, left_turned, right_turned)
 
 
 @pytest.mark.parametrize("left_turned", [False, True])
@@ -356,9 +357,9 @@ def test_whoever_multiplies(whose, monkeypatch):
         raise OSError(path)
 
     if whose == "scipy":
-        monkeypatch.setattr(kernel.ctypes, "CDLL", none_such)
+        monkeypatch.setattr(blas.ctypes, "CDLL", none_such)
     pointer = ctypes.c_void_p
-    sgemm = ctypes.CFUNCTYPE(None, *[pointer] * 13)(kernel.find_sgemm())
+    sgemm = ctypes.CFUNCTYPE(None, *[pointer] * 13)(blas.find_sgemm())
     left, right, result = np.array([[1, 2], [3, 4]], "f"), np.array([[5, 6], [7, 8]], "f"), np.zeros((2, 2), "f")
     letters, size, factors = np.frombuffer(b"NN", np.uint8), np.array([2], np.int64), np.array([1, 0], "f")
     at = [x.ctypes.data for x in (letters, size, factors, right, left, result)]

@@ -6,16 +6,15 @@ products, torch's own where it can be found, and loops do all else: what belongs
 cache, and loops are compiled in less time than expressions of arrays.
 """
 
-import ctypes
 import math
-from collections.abc import Callable
 from typing import Any
 
-import llvmlite.binding
 import numpy as np
-import torch as th
-from numba import carray, njit, types
-from numba.extending import get_cython_function_address, intrinsic
+from numba import carray, types
+from numba.extending import intrinsic
+
+from sb3_skillgraph.options.blas import product
+from sb3_skillgraph.options.compiling import compiled, inner
 
 Network = list[np.ndarray]  # weight (out, in) and bias (1, out) of each layer
 Learner = list[Network]  # a network, its target, both moments of Adam, its numbers of steps
@@ -23,89 +22,6 @@ Places = np.ndarray  # of a learner's arrays in memory: address, rows and column
 Rates = tuple[float, float, float, float, float]  # Adam's learning rate, betas and epsilon; tau, 0 for no target to move
 # Observations, actions, next observations, noise on next actions, rewards, discounts (0 after an end): (batch, width).
 Batch = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
-
-
-def compiled(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
-    """
-    Have numba compile a function when it is first called, and keep the result on disk where it finds a place for it.
-
-    :param function: one that numba understands
-    :param options: further ones of numba's
-    :return: the same in machine code
-    """
-    # NumPy's division does not check for zeros, which lets loops be vectorised.
-    options = {"error_model": "numpy", "no_cfunc_wrapper": True, **options}
-    try:
-        return njit(function, cache=True, **options)
-    except RuntimeError:
-        return njit(function, **options)
-
-
-def inner(function: Callable[..., Any]) -> Callable[..., Any]:
-    """
-    Compile a function that only compiled ones call: without what Python would call it by, that is a fifth sooner.
-
-    :param function: one that numba understands
-    :return: the same in machine code
-    """
-    return compiled(function, no_cpython_wrapper=True)
-
-
-def find_sgemm() -> int:
-    """
-    :return: address of BLAS's product of matrices: torch's (at these sizes Intel's, which it has on x86, takes two thirds of
-        the time), else SciPy's
-    """
-    try:
-        address = ctypes.cast(ctypes.CDLL(th._C.__file__).sgemm_, ctypes.c_void_p).value
-    except (AttributeError, OSError):
-        address = None
-    return address or get_cython_function_address("scipy.linalg.cython_blas", "sgemm")
-
-
-_TEXT, _WHOLE, _FLOAT = (types.CPointer(kind) for kind in (types.uint8, types.int64, types.float32))
-_NAME = "sb3_skillgraph_sgemm"  # by which compiled code on disk finds it again
-llvmlite.binding.add_symbol(_NAME, find_sgemm())
-# Whether to transpose; sizes; a factor; matrices with the lengths of their rows; another factor; the result, likewise
-_sgemm: Any = types.ExternalFunction(
-    _NAME,
-    types.void(_TEXT, _TEXT, _WHOLE, _WHOLE, _WHOLE, _FLOAT, _FLOAT, _WHOLE, _FLOAT, _WHOLE, _FLOAT, _FLOAT, _WHOLE),
-)
-
-
-@inner
-def product(left: np.ndarray, right: np.ndarray, left_turned: bool, right_turned: bool) -> np.ndarray:
-    """
-    :param left: (m, k), or (k, m) if it is to be transposed
-    :param right: (k, n), or (n, k) if it is to be transposed
-    :param left_turned: whether it is
-    :param right_turned: whether it is
-    :return: (m, n)
-    """
-    m, k = (left.shape[1], left.shape[0]) if left_turned else left.shape
-    n = right.shape[0] if right_turned else right.shape[1]
-    result = np.empty((m, n), np.float32)
-    # BLAS goes by columns, and sees every matrix transposed: the right one comes first. Whole numbers of 64 bits are read
-    # right by one that expects 32, too, where the low ones come first.
-    turn = np.array([ord("T") if right_turned else ord("N"), ord("T") if left_turned else ord("N")], np.uint8)
-    sizes = np.array([n, m, k, right.shape[1], left.shape[1]], np.int64)
-    factors = np.array([1.0, 0.0], np.float32)
-    _sgemm(
-        turn.ctypes,
-        turn[1:].ctypes,
-        sizes.ctypes,
-        sizes[1:].ctypes,
-        sizes[2:].ctypes,
-        factors.ctypes,
-        right.ctypes,
-        sizes[3:].ctypes,
-        left.ctypes,
-        sizes[4:].ctypes,
-        factors[1:].ctypes,
-        result.ctypes,
-        sizes.ctypes,
-    )
-    return result
 
 
 @inner
