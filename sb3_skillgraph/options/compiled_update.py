@@ -83,7 +83,7 @@ class CompiledUpdate:
         """
         # Drawn even where it is clipped to nothing (DDPG), so that torch's generator ends where SB3 leaves it.
         n = len(data.actions)
-        noise = th.empty(n, self._n_actions).normal_(0, model.target_policy_noise)
+        noise = th.empty(n, self._n_actions, dtype=th.float32).normal_(0, model.target_policy_noise)
         discounts = np.float32(model.gamma) if data.discounts is None else _rows(data.discounts, n, 1)
         batch = (
             _rows(data.observations, n, self._n_observations),
