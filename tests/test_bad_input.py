@@ -882,15 +882,15 @@ def test_interrupt_in_a_callback() -> None:
 def test_interrupt_in_an_update(monkeypatch: pytest.MonkeyPatch) -> None:
     env = Recorder(gym.make(TOY))
     agent = new_agent(env)
-    replay, sample = agent.parts.walker.replay, agent.parts.walker.replay.sample
+    replay, minibatch = agent.parts.walker.replay, agent.parts.walker.replay.minibatch
 
     def interrupted(*arguments: Any, **kwargs: Any) -> Any:
         if agent.num_timesteps == 260:
             raise KeyboardInterrupt
-        return sample(*arguments, **kwargs)
+        return minibatch(*arguments, **kwargs)
 
     with monkeypatch.context() as patch:
-        patch.setattr(replay, "sample", interrupted)
+        patch.setattr(replay, "minibatch", interrupted)
         with pytest.raises(KeyboardInterrupt):
             agent.learn(400)
     assert agent.parts.store.total == agent.num_timesteps == 260
