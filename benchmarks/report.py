@@ -106,7 +106,8 @@ def command(plan: str) -> str:
 def methods(plan: str) -> str:
     """Return a table of all methods of a plan on all its tasks."""
     rows = summary(plan)
-    first = f"`{rows[0]['method']}`"
+    # The one that the others are compared with, which need not be the best
+    first = next(f"`{row['method']}`" for row in rows if math.isnan(row["difference"]))
     head = ("Task", "Steps", "Method", "Success", f"Difference to {first}", "Steps to goals", f"Over {first}", "Seeds")
     lines = [
         (
