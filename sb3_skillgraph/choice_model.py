@@ -18,7 +18,6 @@ FAR = 2.0
 #: Share of the success of a walk to an event that is left for a goal beside its centre.
 BESIDE = 0.98
 
-
 #: Weights of runs by the events that walks begin in, and by those that they lead to: of some of the runs, and of all. Of
 #: hasty walks, which are no kin of others, they stand behind those of all others.
 ByEnd = list[tuple[np.ndarray, np.ndarray]]
@@ -34,8 +33,7 @@ class ChoiceModel:
     def __init__(self, graph: SkillGraph, model: WalkModel) -> None:
         self.graph = graph
         self.model = model
-        self._walks: tuple[tuple[int, int], Choices] | None = None
-        self._kin: ByEnd = []  # successes and runs of these walks
+        self._known: tuple[tuple[int, int], Choices, ByEnd] | None = None
 
     @property
     def version(self) -> tuple[int, int]:
@@ -46,9 +44,13 @@ class ChoiceModel:
 
     def walks(self) -> Choices:
         """Return what training has shown of each edge, in the order of the graph's edges (not to be changed)."""
-        if self._walks is None or self._walks[0] != self.version:
-            self._walks = self.version, self._gather()
-        return self._walks[1]
+        return self._shown()[0]
+
+    def _shown(self) -> tuple[Choices, ByEnd]:
+        """Return the walks, and the successes and runs of their kin; the same until something is learned."""
+        if self._known is None or self._known[0] != self.version:
+            self._known = self.version, *self._gather()
+        return self._known[1:]
 
     def kinds(self) -> Kind:
         """Return what is known of the graph's walks beside their runs."""
@@ -57,14 +59,14 @@ class ChoiceModel:
         distance, changes = graph.metric.travel(*ends), graph.metric.mismatches(*ends)
         return Kind(distance, edges.crossing_steps, edges.forward, edges.backward, changes)
 
-    def _gather(self) -> Choices:
+    def _gather(self) -> tuple[Choices, ByEnd]:
         edges, aging, kinds = self.graph.edges, self.graph.aging(), self.kinds()
         # What has been tried tells by its own runs, what has not by what others of its kind and place have done
         successes, failures = edges.successes * aging, edges.failures * aging
         apart = len(self.graph.events) * self.model.is_hasty(kinds)  # hasty walks have events of their own, behind the others
         ends = edges.source + apart, edges.target + apart
-        self._kin = self._by_end(ends, successes, successes + failures)
-        guess = self._with_kin(self.model.success(kinds), ends, self._kin, successes, successes + failures)
+        kin = self._by_end(ends, successes, successes + failures)
+        guess = self._with_kin(self.model.success(kinds), ends, kin, successes, successes + failures)
         # A guess of the steps counts for one run.
         steps = (self.model.steps(kinds) + edges.success_steps * aging) / (1.0 + successes)
         failed_steps = (self.model.patience * timeout(steps) + edges.failure_steps * aging) / (1.0 + failures)
@@ -72,8 +74,8 @@ class ChoiceModel:
         far = self.far_failures(kinds)
         loss = self._with_kin(self._loss(kinds), ends, self._by_end(ends, far, failures), far, failures)
         weight = edges.landing_weight * aging[:, None]
-        times = (steps, failed_steps)
-        return Choices(edges.source, edges.target, guess, successes, failures, *times, loss, edges.landing, weight)
+        known = (edges.source, edges.target, guess, successes, failures)
+        return Choices(*known, steps, failed_steps, loss, edges.landing, weight), kin
 
     def _loss(self, kinds: Kind) -> np.ndarray:
         return np.where(self.model.is_hasty(kinds), self.model.loss[0], self.model.loss[1])
@@ -203,8 +205,8 @@ class ChoiceModel:
         if not let_go.any():
             return guessed
         # Such walks are judged by their kin, as those are that an edge stands for
-        self.walks()  # with their kin as of now
-        judged = self._with_kin(guessed.guess, (event, np.full_like(event, home)), self._kin)
+        _, kin = self._shown()
+        judged = self._with_kin(guessed.guess, (event, np.full_like(event, home)), kin)
         return guessed._replace(guess=np.where(let_go, judged, guessed.guess))
 
     def _short(self, guessed: Choices, least: int) -> Choices:

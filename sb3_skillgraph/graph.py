@@ -48,8 +48,8 @@ class SkillGraph:
         self._now = 0.0
         self.version = 0  # rises with every change
         self.centers = np.zeros((0, goal_dim))  # of the events
-        self.visits = np.zeros(0)  # of each event
-        self.barren = np.zeros(0)  # explorations from each event, since one found something
+        self.visits: np.ndarray = np.zeros(0)  # of each event
+        self.barren: np.ndarray = np.zeros(0)  # explorations from each event, since one found something
         self.walk_ids: list[str] = []  # of the walks to the events, in their order
         self._index: dict[str, int] = {}  # of events, by their ids and by those of the walks to them
         self.n_made = 0  # events so far, those that were merged included
@@ -142,8 +142,7 @@ class SkillGraph:
         self.walk_ids = [self.walk_ids[i] for i in kept]
         self._index = self._build_index()
         self.centers = self.centers[kept]
-        self.visits = np.bincount(new_index, self.visits).astype(np.float64)
-        self.barren = np.bincount(new_index, self.barren).astype(np.float64)
+        self.visits, self.barren = (np.bincount(new_index, counts) for counts in (self.visits, self.barren))
         self.edges = Edges()
         for row in range(old_edges.size):
             source, target = int(new_index[old_edges.source[row]]), int(new_index[old_edges.target[row]])

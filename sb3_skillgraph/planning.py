@@ -190,8 +190,8 @@ class Planner:
         known, walks = self._worked_out(stance), self.choice_model.walks()
         # Edges that the episode has shown more of stand among its own choices, and not among those of training
         replaced, episode = self.choice_model.of_episode(start, goal, runs, everywhere)
-        constant = known.constant.copy()
-        constant[replaced] = np.inf
+        known = known._replace(constant=known.constant.copy())
+        known.constant[replaced] = np.inf
         linear = Linear.of(episode, stance, n_vertices)
         values = np.full(n_vertices, self.lost)
         values[n_events] = 0.0
@@ -199,7 +199,7 @@ class Planner:
             before = values
             # One sweep: every vertex takes its cheapest choice, by the values of the last sweep
             values = np.full(n_vertices, self.lost)
-            costs, episode_costs = constant + known.matrix @ before, linear.costs(before)
+            costs, episode_costs = known.costs(before), linear.costs(before)
             np.minimum.at(values, walks.source, costs)
             np.minimum.at(values, episode.source, episode_costs)
             values[n_events] = 0.0

@@ -128,7 +128,6 @@ class OptionReplay(ReplayBuffer):
         self.view = view
         self.rule = rule
         self.rng = rng
-        self.everything = rule.termination is None
         self.hindsight = hindsight
         self.shared = shared
         self.horizon = horizon
@@ -138,9 +137,14 @@ class OptionReplay(ReplayBuffer):
         self._rows = np.zeros(256, dtype=np.int64)
         self._n_rows = 0
 
+    @property
+    def _owns_all(self) -> bool:
+        """Whether all rows of the store count as the option's own: of one that is given its goal."""
+        return self.rule.termination is None
+
     def size(self) -> int:
         """Return how many transitions of its own the option can learn from."""
-        return len(self.store) if self.everything else len(self._readable())
+        return len(self.store) if self._owns_all else len(self._readable())
 
     def add_rows(self, rows: np.ndarray) -> None:
         """Remember rows on which the option ran.
@@ -178,7 +182,7 @@ class OptionReplay(ReplayBuffer):
         :param batch_size: number of transitions
         """
         rng, store = self.rng, self.store
-        if self.everything:
+        if self._owns_all:
             n_own = batch_size
             rows = rng.integers(store.oldest, store.total, size=batch_size)
             imagined = rng.random(batch_size) < self.hindsight

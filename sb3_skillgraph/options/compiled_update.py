@@ -81,8 +81,8 @@ class CompiledUpdate:
         :param with_actor: whether the actor learns too, and all targets move
         :return: the critics' loss and the actor's (NaN without the actor)
         """
-        # Drawn even where it is clipped to nothing (DDPG), so that torch's generator ends where SB3 leaves it.
         n = len(data.actions)
+        # Drawn even where it is clipped to nothing (DDPG), so that torch's generator ends where SB3 leaves it.
         noise = th.empty(n, self._n_actions, dtype=th.float32).normal_(0, model.target_policy_noise)
         discounts = np.float32(model.gamma) if data.discounts is None else _rows(data.discounts, n, 1)
         batch = (

@@ -27,7 +27,7 @@ class OptionFactory:
     :param store: the shared memory of transitions
     :param view: what a policy sees
     :param action_space: action space of the environment
-    :param radius: the event radius, in goal units
+    :param metric: of goal space
     :param tolerance: distance within which the global option's goals and those put in by hindsight are reached
     :param rng: random generator
     :param replay_kwargs: ``hindsight``, ``shared`` and ``horizon`` of :class:`OptionReplay`

@@ -129,8 +129,10 @@ class PaperPolicy:
         :return: the plan; its path is empty where the policy over options decides
         """
         way, status = self.way(state, 0, point, goal), self._status(goal)
-        if way is None or not way.at_goal:
-            return PaperPlan(status, () if way is None else tuple(way.vertices), self.horizon, 0.0)
+        if way is None:
+            return PaperPlan(status, (), self.horizon, 0.0)
+        if not way.at_goal:
+            return PaperPlan(status, tuple(way.vertices), self.horizon, 0.0)
         remaining = max(self.horizon - float(state.elapsed[0] - state.steps[0]), 1.0)
         return PaperPlan(status, (*way.vertices, GOAL), *self.worth(way.vertices, remaining))
 
