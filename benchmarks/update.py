@@ -6,22 +6,22 @@ over the turns. *Fresh* models have just been built, their buffer full of noise.
 SB3 has trained in 5000 steps of a ``SkillGraphAgent`` on PointMaze, their buffer full of its minibatches: many units have
 died, and Adam's moments of dead units have decayed into denormal numbers, which many processors are slow at.
 
-Beside them the time that the update's matrix products alone take, the weights where they are, over and over: by torch's
-BLAS, which is the kernel's and SB3's, and by SciPy's, which is what compiled code would multiply by otherwise. No update,
-which samples a minibatch as well, can be faster than the former. On a GPU (``--device cuda``), where there is no kernel,
-only SB3's and torch's updates are compared, fresh.
+Beside them, and in turn with them, the matrix products that the kernel's update cannot do without: by the same BLAS, the
+weights where they are. On a GPU (``--device cuda``), where there is no kernel, only SB3's and torch's updates are compared,
+fresh.
 
 Run it with ``OMP_NUM_THREADS=1 python -m benchmarks.update --out benchmarks/results/update.json``.
 """
 
 import argparse
+import copy
 import dataclasses
-import itertools
 import json
 import platform
 import statistics
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -29,11 +29,14 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from numba import njit
+from numba.typed import List
 from stable_baselines3 import DDPG, TD3
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.logger import Logger
+from torch import nn
 
 from sb3_skillgraph import SkillGraphAgent
+from sb3_skillgraph.options.blas import product
 from sb3_skillgraph.options.learner import OptionDDPG, OptionTD3
 
 ENV = "SkillGraph/PointMazeMedium-v0"
@@ -69,9 +72,8 @@ CASES = [
     Case("TD3", (128, 128), 256, 4.0, 2.8),
     Case("DDPG", (128, 128), 128),
 ]
-OVER_PRODUCTS = 1.3, 1.6  # aim and floor of the kernel's time over that of the products by its own BLAS
-BLAS = "torch", "scipy"  # whose products are timed beside it
-COLUMNS = ("sb3", "reference", "kernel", "speedup", *(f"{what}_{blas}" for blas in BLAS for what in ("products", "over")))
+OVER_PRODUCTS = 1.3, 1.6  # aim and floor of the kernel's time over that of its products
+COLUMNS = "sb3", "reference", "kernel", "products", "speedup", "over"
 AGEING = 1.1  # what an aged model's time may be over a fresh one's
 
 
@@ -135,8 +137,9 @@ def grow_old(models: list[TD3], old: TD3) -> None:
     samples = [old.replay_buffer.sample(BUFFER // 10) for _ in range(10)]
     for model in models:
         model.policy.load_state_dict(old.policy.state_dict())
-        model.actor.optimizer.load_state_dict(old.actor.optimizer.state_dict())
-        model.critic.optimizer.load_state_dict(old.critic.optimizer.state_dict())
+        # A copy each: an optimiser takes the very tensors that it is given.
+        model.actor.optimizer.load_state_dict(copy.deepcopy(old.actor.optimizer.state_dict()))
+        model.critic.optimizer.load_state_dict(copy.deepcopy(old.critic.optimizer.state_dict()))
         model.gamma = old.gamma
         buffer = model.replay_buffer
         assert isinstance(buffer, ReplayBuffer)
@@ -155,112 +158,129 @@ def denormals(model: TD3) -> float:
     return ((moments > 0) & (moments < th.finfo(th.float32).tiny)).float().mean().item()
 
 
-def products(case: Case) -> list[tuple[float, str, tuple[int, int]]]:
-    """
-    :param case: the networks and the minibatch
-    :return: how often one update needs which product of which layer, none of them avoidable, as (times, "forward",
-        "weights" or "inputs", (in, out)); the last two are the gradients of a layer's weights and of its inputs
-    """
-    n_obs, n_actions = SIZES
-    critics, delay = (1, 1) if case.algorithm == "DDPG" else (2, 2)
-    result: list[tuple[float, str, tuple[int, int]]] = []
-    for layer in itertools.pairwise((n_obs, *case.net_arch, n_actions)):
-        # The target's actions at every update, the actor's own when it learns.
-        result += [(1 + 1 / delay, "forward", layer), (1 / delay, "weights", layer)]
-        result += [(1 / delay, "inputs", layer)] if layer[0] != n_obs else []
-    for layer in itertools.pairwise((n_obs + n_actions, *case.net_arch, 1)):
-        # Every critic and its target at every update; the first critic once more for the actor's loss.
-        result += [(2 * critics + 1 / delay, "forward", layer), (critics, "weights", layer)]
-        result += [(critics + 1 / delay if layer[0] != n_obs + n_actions else 1 / delay, "inputs", layer)]
-    return result
+@njit
+def layer_by_layer(weights: list[np.ndarray], inputs: np.ndarray) -> list[np.ndarray]:
+    """Multiply on the way forward: return what every layer is given, and last what the network returns."""
+    values = [inputs]
+    for weight in weights:
+        values.append(product(values[-1], weight, False, True))
+    return values
 
 
 @njit
-def multiply(left: np.ndarray, right: np.ndarray, out: np.ndarray) -> None:
-    """Multiply as compiled code does by itself, (m, k) by (k, n), into (m, n)."""
-    np.dot(left, right, out)
+def back(weights: list[np.ndarray], values: list[np.ndarray], learns: bool, to_inputs: bool) -> None:
+    """Multiply on the way back, for the gradients of the weights if they learn, and on to the inputs if it is asked."""
+    gradient = values[-1]
+    for layer in range(len(weights) - 1, -1, -1):
+        if learns:
+            product(gradient, values[layer], True, False)
+        if layer > 0 or to_inputs:
+            gradient = product(gradient, weights[layer], False, False)
 
 
-def multiplier(blas: str, left: np.ndarray, right: np.ndarray, out: np.ndarray) -> Callable[[], object]:
+@njit
+def products(
+    actor: list[list[np.ndarray]],
+    critics: list[list[list[np.ndarray]]],
+    seen: np.ndarray,
+    valued: np.ndarray,
+    with_actor: bool,
+) -> None:
     """
-    :param blas: one of ``BLAS``
-    :param left: (m, k)
-    :param right: (k, n)
-    :param out: (m, n)
-    :return: what multiplies them when it is called
+    Multiply as one update has to, and do nothing else.
+
+    :param actor: weights (out, in) of the layers of the actor and of its target
+    :param critics: of each critic, likewise
+    :param seen: what actors are given, (batch, observation)
+    :param valued: what critics are given, (batch, observation + action)
+    :param with_actor: whether the actor learns, too
     """
-    if blas == "scipy":
-        return lambda: multiply(left, right, out)
-    factors, result = [th.from_numpy(left), th.from_numpy(right)], th.from_numpy(out)
-    return lambda: th.mm(*factors, out=result)
+    layer_by_layer(actor[1], seen)
+    for critic in critics:
+        layer_by_layer(critic[1], valued)
+    for critic in critics:
+        back(critic[0], layer_by_layer(critic[0], valued), True, False)
+    if with_actor:
+        values = layer_by_layer(actor[0], seen)
+        back(critics[0][0], layer_by_layer(critics[0][0], valued), False, True)
+        back(actor[0], values, True, False)
 
 
-def product_seconds(blas: str, kind: str, batch_size: int, layer: tuple[int, int], repeats: int) -> float:
+def weights(network: nn.Module) -> list[np.ndarray]:
     """
-    :param blas: one of ``BLAS``
-    :param kind: see ``products``
+    :param network: an actor's or a critic's
+    :return: the weights of its layers, where they are
+    """
+    return List([module.weight.detach().numpy() for module in network.children() if isinstance(module, nn.Linear)])
+
+
+def multiplier(model: TD3, batch_size: int) -> Callable[[], None]:
+    """
+    :param model: whose networks are multiplied with
     :param batch_size: transitions in a minibatch
-    :param layer: numbers in and out
-    :param repeats: number of timings
-    :return: the median of the seconds that it takes
+    :return: what does the products of two updates
     """
-    fan_in, fan_out = layer
+    n_obs, n_actions = SIZES
     rng = np.random.default_rng(0)
-    weight, inputs, gradient = (
-        rng.normal(size=shape).astype(np.float32) for shape in ((fan_out, fan_in), (batch_size, fan_in), (batch_size, fan_out))
-    )
-    left, right = {"forward": (inputs, weight.T), "weights": (gradient.T, inputs), "inputs": (gradient, weight)}[kind]
-    out = np.empty((left.shape[0], right.shape[1]), np.float32)
-    return statistics.median(timed(multiplier(blas, left, right, out), repeats))
+    seen, valued = (rng.normal(size=(batch_size, size)).astype(np.float32) for size in (n_obs, n_obs + n_actions))
+    actor = List([weights(network) for network in (model.actor.mu, model.actor_target.mu)])
+    pairs = zip(model.critic.q_networks, model.critic_target.q_networks, strict=True)
+    critics = List([List([weights(network) for network in pair]) for pair in pairs])
+
+    def multiply() -> None:
+        products(actor, critics, seen, valued, True)
+        products(actor, critics, seen, valued, model.policy_delay == 1)
+
+    return multiply
 
 
-def timed(function: Callable[[], object], repeats: int) -> list[float]:
+def measure(case: Case, ages: dict[str, dict[str, TD3]], repeats: int) -> dict[str, dict[str, float]]:
     """
-    :param function: what to time
-    :param repeats: how often
-    :return: seconds of every call after the first three
-    """
-    seconds = []
-    for i in range(repeats + 3):
-        start = time.perf_counter()
-        function()
-        if i >= 3:
-            seconds.append(time.perf_counter() - start)
-    return seconds
-
-
-def measure(ages: dict[str, dict[str, TD3]], batch_size: int, repeats: int) -> dict[str, dict[str, float]]:
-    """
+    :param case: what the models are built for
     :param ages: for each age the models; all learn twice a turn, one gradient step a call as after a single environment
-        step: an even number, for TD3 to teach its actor in half of them
-    :param batch_size: transitions in a minibatch
+        step: an even number, for TD3 to teach its actor in half of them. If there is a kernel, its products have a turn,
+        too, with networks that no other has just brought into the cache
     :param repeats: number of turns
-    :return: for each age the median milliseconds of an update of each model, and "speedup", the median over turns of the
-        first model's over the last's
+    :return: for each age the median milliseconds of an update of each model and of the products; "speedup" and "over", the
+        medians over turns of SB3's time over the last model's and of the kernel's over that of its products
     """
-    turns: dict[str, list[list[float]]] = {age: [] for age in ages}
+    twice: dict[str, dict[str, Callable[[], None]]] = {}
+    for age, models in ages.items():
+        twice[age] = {name: partial(update_twice, model, case.batch_size) for name, model in models.items()}
+        if "kernel" in models:
+            twice[age]["products"] = multiplier(build(CLASSES[case.algorithm][1], case), case.batch_size)
+    turns: dict[str, list[dict[str, float]]] = {age: [] for age in ages}
     for _ in range(repeats + 3):
-        for age, models in ages.items():
-            turns[age].append([timed_updates(model, batch_size) for model in models.values()])
+        for age, functions in twice.items():
+            turns[age].append({name: timed(function) / 2 for name, function in functions.items()})
     rows = {}
     for age, models in ages.items():
         counted = turns[age][3:]
-        columns = zip(*counted, strict=True)
-        rows[age] = {name: 1e3 * statistics.median(column) for name, column in zip(models, columns, strict=True)}
-        rows[age]["speedup"] = statistics.median(turn[0] / turn[-1] for turn in counted)
+        rows[age] = {name: 1e3 * statistics.median(turn[name] for turn in counted) for name in twice[age]}
+        ours = list(models)[-1]
+        rows[age]["speedup"] = statistics.median(turn["sb3"] / turn[ours] for turn in counted)
+        if "kernel" in models:
+            rows[age]["over"] = statistics.median(turn["kernel"] / turn["products"] for turn in counted)
     return rows
 
 
-def timed_updates(model: TD3, batch_size: int) -> float:
+def update_twice(model: TD3, batch_size: int) -> None:
     """
     :param model: learns twice
     :param batch_size: transitions in a minibatch
-    :return: seconds of one update
+    """
+    model.train(1, batch_size)
+    model.train(1, batch_size)
+
+
+def timed(function: Callable[[], object]) -> float:
+    """
+    :param function: what to time
+    :return: seconds it took
     """
     start = time.perf_counter()
-    model.train(1, batch_size)
-    model.train(1, batch_size)
-    return (time.perf_counter() - start) / 2
+    function()
+    return time.perf_counter() - start
 
 
 def contenders(case: Case, device: str) -> dict[str, TD3]:
@@ -290,8 +310,8 @@ def verdict(case: Case, fresh: dict[str, float], aged: dict[str, float]) -> str:
     if fresh["speedup"] < case.aim:
         missed.append("speedup below the " + ("floor" if fresh["speedup"] < case.floor else "aim"))
     aim, floor = OVER_PRODUCTS
-    if fresh["over_torch"] > aim:
-        missed.append("products below the " + ("floor" if fresh["over_torch"] > floor else "aim"))
+    if fresh["over"] > aim:
+        missed.append("products below the " + ("floor" if fresh["over"] > floor else "aim"))
     if aged["kernel"] > AGEING * fresh["kernel"]:
         missed.append("slower with age")
     return ", ".join(missed) or "ok"
@@ -315,14 +335,10 @@ def main() -> None:
             ages["aged"] = contenders(case, arguments.device)
             old = walker(case)
             grow_old(list(ages["aged"].values()), old)
-        rows = measure(ages, case.batch_size, arguments.repeats)
+        rows = measure(case, ages, arguments.repeats)
         if on_cpu:
             rows["aged"]["denormals"] = denormals(old)
         for age, row in rows.items():
-            for blas in BLAS if on_cpu else ():
-                each = (n * product_seconds(blas, kind, case.batch_size, layer, 20) for n, kind, layer in products(case))
-                row[f"products_{blas}"] = 1e3 * sum(each)
-                row[f"over_{blas}"] = row["kernel"] / row[f"products_{blas}"]
             columns = "".join(f"{row.get(key, float('nan')):{len(key) + 2}.2f}" for key in COLUMNS)
             print(f"{name:<24}{age:<7}{columns}", flush=True)
         if on_cpu:
