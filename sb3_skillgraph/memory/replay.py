@@ -240,9 +240,14 @@ def draw(buffer: ReplayBuffer, batch_size: int, env: VecNormalize | None) -> Min
         columns: list[Any] = [None if column is None else column.numpy() for column in buffer.sample(batch_size, env=env)]
         return Minibatch(*columns)
     # What SB3's own does, without its tensors; a choice of one environment draws nothing from the generator
-    rows = np.random.randint(0, buffer.buffer_size if buffer.full else buffer.pos, size=batch_size)  # noqa: NPY002
-    envs = np.random.randint(0, buffer.n_envs, size=batch_size) if buffer.n_envs > 1 else 0  # noqa: NPY002
-    at = rows, envs
-    dones = buffer.dones[at] * (1 - buffer.timeouts[at])
-    seen = buffer.observations[at], buffer.actions[at], buffer.next_observations[at]
-    return Minibatch(*seen, dones[:, None], buffer.rewards[at][:, None])
+    n_envs = buffer.n_envs
+    at = np.random.randint(0, buffer.buffer_size if buffer.full else buffer.pos, size=batch_size)  # noqa: NPY002
+    if n_envs > 1:
+        at = at * n_envs + np.random.randint(0, n_envs, size=batch_size)  # noqa: NPY002
+
+    def rows(column: np.ndarray) -> np.ndarray:
+        return column.reshape(len(column) * n_envs, -1).take(at, axis=0)
+
+    dones = rows(buffer.dones) * (1 - rows(buffer.timeouts))
+    seen = rows(buffer.observations), rows(buffer.actions), rows(buffer.next_observations)
+    return Minibatch(*seen, dones, rows(buffer.rewards))

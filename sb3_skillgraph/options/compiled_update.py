@@ -51,6 +51,7 @@ class CompiledUpdate:
         self._critics = np.stack([_places(f"critic {i}", *pair, self._optimizers[1], sizes) for i, pair in pairs])
         self._parameters = list(policy.parameters())
         self._layout = self._find_layout()
+        self._noise = th.empty(0, self._n_actions)
 
     def is_of(self, policy: TD3Policy) -> bool:
         """
@@ -82,20 +83,23 @@ class CompiledUpdate:
         :return: the critics' loss and the actor's (NaN without the actor)
         """
         n = len(data.actions)
+        if len(self._noise) != n:
+            self._noise = th.empty(n, self._n_actions, dtype=th.float32)
         # Drawn even where it is clipped to nothing (DDPG), so that torch's generator ends where SB3 leaves it.
-        noise = th.empty(n, self._n_actions, dtype=th.float32).normal_(0, model.target_policy_noise)
+        self._noise.normal_(0, model.target_policy_noise)
         discounts = np.float32(model.gamma) if data.discounts is None else _rows(data.discounts, n, 1)
         batch = (
             _rows(data.observations, n, self._n_observations),
             _rows(data.actions, n, self._n_actions),
             _rows(data.next_observations, n, self._n_observations),
-            noise.numpy().clip(-model.target_noise_clip, model.target_noise_clip),
+            self._noise.numpy(),
             _rows(data.rewards, n, 1),
             (np.float32(1) - _rows(data.dones, n, 1)) * discounts,
         )
         tau = model.tau if with_actor else 0.0
         actor_rates, critic_rates = (_rates(optimizer, tau) for optimizer in self._optimizers)
-        return self._kernel.update(batch, self._actor, self._critics, actor_rates, critic_rates, float(penalty), with_actor)
+        learners = self._actor, self._critics, actor_rates, critic_rates
+        return self._kernel.update(batch, *learners, float(model.target_noise_clip), float(penalty), with_actor)
 
 
 def why_not(policy: Any) -> str | None:

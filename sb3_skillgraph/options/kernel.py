@@ -139,23 +139,25 @@ def backward(learner: Learner, values: list[np.ndarray], gradient: np.ndarray, r
 
 
 @inner
-def update_critics(batch: Batch, actor_target: Network, critics: list[Learner], rates: Rates) -> float:
+def update_critics(batch: Batch, actor_target: Network, critics: list[Learner], noise_clip: float, rates: Rates) -> float:
     """
     Teach all critics the same values.
 
     :param batch: what they learn from
     :param actor_target: the target of the actor
     :param critics: one or more
+    :param noise_clip: the most that noise changes a next action by
     :param rates: of the critics
     :return: the mean squared error, summed over critics
     """
     observations, actions, next_observations, noise, rewards, discounts = batch
     n = len(rewards)
+    most = np.float32(noise_clip)
     # Select actions by the target of the actor, and add noise.
     next_actions = forward(actor_target, next_observations)[-1]
     for i in range(n):
         for j in range(next_actions.shape[1]):
-            next_action = math.tanh(next_actions[i, j]) + noise[i, j]
+            next_action = math.tanh(next_actions[i, j]) + max(-most, min(noise[i, j], most))
             if next_action < -1:
                 next_action = np.float32(-1)
             if next_action > 1:
@@ -256,6 +258,7 @@ def update(
     critics: np.ndarray,
     actor_rates: Rates,
     critic_rates: Rates,
+    noise_clip: float,
     penalty: float,
     with_actor: bool,
 ) -> tuple[float, float]:
@@ -267,13 +270,14 @@ def update(
     :param critics: one or more, (critics, 5, parameters, 3)
     :param actor_rates: of the actor
     :param critic_rates: of the critics
+    :param noise_clip: see ``update_critics``
     :param penalty: see ``update_actor``
     :param with_actor: whether the actor learns, too
     :return: the critics' loss and the actor's (NaN without the actor)
     """
     actor_learner = learner_at(actor)
     critic_learners = [learner_at(critic) for critic in critics]
-    critic_loss = update_critics(batch, actor_learner[1], critic_learners, critic_rates)
+    critic_loss = update_critics(batch, actor_learner[1], critic_learners, noise_clip, critic_rates)
     if not with_actor:
         return critic_loss, math.nan
     return critic_loss, update_actor(batch[0], actor_learner, critic_learners[0][0], penalty, actor_rates)
