@@ -19,7 +19,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 from stable_baselines3.td3.policies import MultiInputPolicy
 
 from sb3_skillgraph import persistence
-from sb3_skillgraph.arguments import check_arguments, check_attributes
+from sb3_skillgraph.arguments import check_arguments, check_attributes, horizon
 from sb3_skillgraph.events import Event
 from sb3_skillgraph.goal_env import GoalSpec, as_batch, as_goal, check_finite, refuse_changed_goals, rows, with_terminal
 from sb3_skillgraph.interrupts import Interrupts
@@ -621,10 +621,13 @@ class SkillGraphAgent(OffPolicyAlgorithm):
         """
         Give the agent another environment with the same spaces and the same number of copies.
 
+        From now on plans are about its episodes.
+
         :param force_reset: whether ``learn`` begins at a fresh episode; False to go on where the saved environments were
         :raises ValueError: if the environment does not fit, or is normalised by VecNormalize
         """
         refuse_changed_goals(env)
         super().set_env(env, force_reset)
+        self.parts.planner.horizon = horizon(self.env)
         if force_reset:
             self._env_snapshot, self._loaded = None, None

@@ -1,6 +1,7 @@
 """From anywhere to anywhere: the success rate over random pairs of start and goal (section 4.2)."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -11,6 +12,7 @@ from tqdm import tqdm
 
 from sb3_skillgraph.agent import SkillGraphAgent
 from sb3_skillgraph.envs import MazeGeometry, find
+from sb3_skillgraph.envs.wrappers import time_limit
 from sb3_skillgraph.goal_env import metric_of
 from sb3_skillgraph.hyperparams import make_recommended
 from sb3_skillgraph.planning import DIRECT
@@ -254,6 +256,13 @@ def run_pair(
     :param cells: length of the shortest free path, in cells
     :return: what became of it
     """
+    with _planning_for(agent, env):
+        return _run_pair(agent, env, start, goal, cells)
+
+
+def _run_pair(
+    agent: PolicyPredictor, env: gym.Env, start: np.ndarray | None, goal: np.ndarray | None, cells: float
+) -> PairResult:
     has_reached = _judge(agent, env)
     observation, info = env.reset(options=None if goal is None else {"start": start, "goal": goal})
     start = np.array(observation["achieved_goal"]) if start is None else start
@@ -277,6 +286,21 @@ def run_pair(
     if watch is not None:
         status, trace = watch.plan.status, watch.ended(success and steps > 0)
     return PairResult(start, goal, cells, success, steps, status, trace, nearest, stuck)
+
+
+@contextmanager
+def _planning_for(agent: PolicyPredictor, env: gym.Env) -> Iterator[None]:
+    """Let an agent plan for the episodes of an environment: they may be longer than those that it has learned in."""
+    limit = time_limit(env)
+    if not isinstance(agent, SkillGraphAgent) or limit is None:
+        yield
+        return
+    planner = agent.parts.planner
+    own, planner.horizon = planner.horizon, limit
+    try:
+        yield
+    finally:
+        planner.horizon = own
 
 
 def _judge(agent: PolicyPredictor, env: gym.Env) -> Callable[[Any, dict[str, Any]], bool]:

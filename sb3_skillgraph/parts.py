@@ -184,12 +184,11 @@ class Parts:
     def get_state(self) -> dict[str, Any]:
         """Return what has been learned beside the walker's networks, as plain data."""
         skills = [skill_state(skill) for skill in self.skills.values()]
-        learned = {"graph": self.graph.get_state(), "model": self.model.get_state(), "skills": skills}
-        return {"horizon": self.planner.horizon, "average": self.average.get_state(), **learned}
+        average, model = self.average.get_state(), self.model.get_state()
+        return {"graph": self.graph.get_state(), "model": model, "average": average, "skills": skills}
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Restore what :meth:`get_state` returned."""
-        self.planner.horizon = state["horizon"]
         self.graph.set_state(state["graph"])
         self.model.set_state(state["model"])
         self.average.set_state(state["average"])

@@ -58,6 +58,7 @@ def agent_tree(agent: Any, left_out: Iterable[str]) -> dict[str, Any]:
         "n_envs": agent.n_envs,
         "walker": parts.walker.learner._n_updates,
         "update_path": _update_path(parts.walker.learner),
+        "horizon": parts.planner.horizon,
         "parameters": agent.get_parameters(),
         **parts.get_state(),
         "progress": _progress(agent),
@@ -217,6 +218,8 @@ def _restore(agent: Any, tree: dict[str, Any], same_envs: bool) -> None:
     parts.walker.learner._n_updates = tree["walker"]
     agent.set_parameters(tree["parameters"], exact_match=True, device=agent.device)
     parts.set_state(tree)
+    if agent.env is None:
+        parts.planner.horizon = tree["horizon"]  # else it is what the environment says
     progress = tree["progress"]
     for name in _COUNTERS:
         setattr(agent, name, progress["counters"][name])

@@ -470,3 +470,14 @@ def test_adapt_from_inside_a_wall(trained: SkillGraphAgent) -> None:
         trained.adapt(np.array([-1.0, -1.0]), start=np.array([0.0, 0.0]), total_timesteps=50)
     n_steps = trained.num_timesteps
     assert trained.learn(150, reset_num_timesteps=False).num_timesteps == n_steps + 150
+
+
+def test_plans_are_about_the_episodes_of_the_test(trained: SkillGraphAgent) -> None:
+    env = gym.make(TOY, max_steps=40)
+    before = trained.parts.planner.horizon
+    result = evaluate_pairs(trained, env, n_pairs=20)
+    assert trained.parts.planner.horizon == before
+    longer = evaluate_pairs(trained, gym.make(TOY, max_steps=400), n_pairs=20)
+    promised, promised_longer = (np.mean([trace.promised for trace in each.traces]) for each in (result, longer))
+    assert promised < promised_longer
+    assert abs(promised - result.success_rate) < 0.25 and abs(promised_longer - longer.success_rate) < 0.25

@@ -23,9 +23,10 @@ from sb3_skillgraph.paper.chaining import DeepSkillChaining, SkillChain
 from sb3_skillgraph.paper.graph import PaperGraph
 from sb3_skillgraph.paper.missions import PaperMissions
 from sb3_skillgraph.paper.policy import PaperPolicy
-from sb3_skillgraph.planning import DIRECT, GOAL
+from sb3_skillgraph.planning import DIRECT, GOAL, Planner
 from sb3_skillgraph.plotting import event_links, plot_skill_graph
 from sb3_skillgraph.running import RunnerState
+from sb3_skillgraph.walk_model import WalkModel
 
 RADIUS = 0.5
 NEAR = np.array([0.1, 0.0])
@@ -256,7 +257,7 @@ def line() -> tuple[PaperGraph, DeepSkillChaining, PaperPolicy]:
         chaining.options[id] = new_option(
             graph, id, target, ((start, 0.0), 0.6), effects=((end, 0.0),) * 3, n_failures=n_failures
         )
-    return graph, chaining, PaperPolicy(graph, chaining, 200, 1_000)
+    return graph, chaining, PaperPolicy(graph, chaining, 200, Planner(graph, WalkModel(), 1_000))
 
 
 def test_3_2_4_the_first_option_of_the_cheapest_path_runs() -> None:
@@ -428,7 +429,7 @@ def test_a_6_outside_the_graph_the_policy_over_options_decides() -> None:
     assert policy.plan(state(), far, graph.events[2].center).path == ()
     chain = chaining.open_chain(graph.events[0], graph.events[2])
     assert policy.choose(state(), 0, far, graph.events[2].center, 0.0).option == chain.options[0]
-    empty = PaperPolicy(new_graph(), new_chaining(new_graph()), 200, 1_000)
+    empty = PaperPolicy(new_graph(), new_chaining(new_graph()), 200, policy.planner)
     assert empty.choose(state(), 0, far, NEAR, 0.0).option == DIRECT, "before there is any option"
 
 
@@ -445,7 +446,7 @@ def test_events_may_overlap() -> None:
     chaining = new_chaining(graph)
     chaining.options["o0"] = new_option(graph, "o0", "e1", ((0.0, 0.0), 0.6), effects=((2.4, 0.0),))
     chaining.options["o1"] = new_option(graph, "o1", "e2", ((2.4, 0.0), 0.4), effects=((3.0, 0.0),))
-    policy = PaperPolicy(graph, chaining, 200, 1_000)
+    policy = PaperPolicy(graph, chaining, 200, Planner(graph, WalkModel(), 1_000))
     there, goal = np.array([2.55, 0.0]), np.array([9.0, 0.0])
     assert [event.id for event in graph.events_at(there)] == ["e1", "e2"]
     assert policy.choose(state(), 0, there, goal, 0.0).event == "e2", "of the events that hold it the one nearest to the goal"

@@ -17,7 +17,7 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise, VectorizedActionNoise
 from stable_baselines3.common.utils import set_random_seed
 
-from sb3_skillgraph import SkillGraphAgent
+from sb3_skillgraph import PAPER, SkillGraphAgent
 
 
 def observations(n: int = 16) -> dict[str, np.ndarray]:
@@ -183,6 +183,15 @@ def test_what_was_read_off_the_environment_is_saved(tmp_path: Path) -> None:
     new_agent(gym.make(TOY, success_radius=0.3, max_steps=60)).save(tmp_path / "agent")
     loaded = SkillGraphAgent.load(tmp_path / "agent")
     assert (loaded.event_radius, loaded.parts.planner.horizon, loaded.parts.view_name) == (0.3, 60, "relative")
+
+
+@pytest.mark.parametrize("given", [{}, PAPER])
+def test_plans_are_about_the_episodes_of_the_environment_given(tmp_path: Path, given: dict[str, Any]) -> None:
+    new_agent(gym.make(TOY, max_steps=60), **given).save(tmp_path / "agent")
+    loaded = SkillGraphAgent.load(tmp_path / "agent", env=gym.make(TOY, max_steps=90))
+    assert loaded.parts.planner.horizon == 90
+    loaded.set_env(gym.make(TOY, max_steps=120))
+    assert loaded.parts.planner.horizon == 120
 
 
 def double_view(observation: np.ndarray, achieved_goal: np.ndarray, goal: np.ndarray) -> np.ndarray:

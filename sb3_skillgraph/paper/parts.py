@@ -53,7 +53,7 @@ class PaperParts(Parts):
         chaining = DeepSkillChaining(graph, factory.make, rules.gestation_period)
         model = WalkModel()
         planner = Planner(graph, model, horizon(agent.env))  # never asked: the rules choose
-        policy = PaperPolicy(graph, chaining, rules.timeout, planner.horizon)
+        policy = PaperPolicy(graph, chaining, rules.timeout, planner)
         runner = Runner(graph, planner, walker.actor, view, chaining.options, policy)
         salience = find_salience(arguments, graph, store, agent, relearn=1)
         missions = PaperMissions(graph, chaining, salience, rules, arguments["exploration_steps"], rng)
@@ -88,18 +88,11 @@ class PaperParts(Parts):
     def get_state(self) -> dict[str, Any]:
         """Return what has been learned, the options' networks too, as plain data."""
         options = [skill_state(option) for option in self.chaining.options.values()]
-        return {
-            "horizon": self.planner.horizon,
-            "graph": self.graph.get_state(),
-            "chaining": self.chaining.get_state(),
-            "options": options,
-        }
+        return {"graph": self.graph.get_state(), "chaining": self.chaining.get_state(), "options": options}
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Restore what :meth:`get_state` returned."""
         graph: Any = self.graph
-        self.planner.horizon = state["horizon"]
-        self.policy.horizon = float(state["horizon"])
         graph.set_state(state["graph"])
         options: dict[str, Option] = {}
         for spec in state["options"]:  # an option's parent was made before it

@@ -9,7 +9,7 @@ from sb3_skillgraph.options.option import Option
 from sb3_skillgraph.paper.chaining import DeepSkillChaining
 from sb3_skillgraph.paper.graph import PaperGraph
 from sb3_skillgraph.plan import Plan, Status
-from sb3_skillgraph.planning import DIRECT, GOAL, TIME_BINS
+from sb3_skillgraph.planning import DIRECT, GOAL, TIME_BINS, Planner
 from sb3_skillgraph.runner import Chosen
 from sb3_skillgraph.running import RunnerState
 
@@ -37,14 +37,14 @@ class PaperPolicy:
     :param graph: the skill graph
     :param chaining: the chains
     :param timeout: environment steps an option may run
-    :param horizon: environment steps within which a goal is to be reached
+    :param planner: knows within how many environment steps a goal is to be reached
     """
 
-    def __init__(self, graph: PaperGraph, chaining: DeepSkillChaining, timeout: int, horizon: int) -> None:
+    def __init__(self, graph: PaperGraph, chaining: DeepSkillChaining, timeout: int, planner: Planner) -> None:
         self.graph = graph
         self.chaining = chaining
         self.timeout = timeout
-        self.horizon = float(horizon)
+        self.planner = planner
 
     def choose(self, state: RunnerState, i: int, point: np.ndarray, goal: np.ndarray, stance: float) -> Chosen:
         """Choose the option that runs next.
@@ -130,10 +130,10 @@ class PaperPolicy:
         """
         way, status = self.way(state, 0, point, goal), self._status(goal)
         if way is None:
-            return PaperPlan(status, (), self.horizon, 0.0)
+            return PaperPlan(status, (), float(self.planner.horizon), 0.0)
         if not way.at_goal:
-            return PaperPlan(status, tuple(way.vertices), self.horizon, 0.0)
-        remaining = max(self.horizon - float(state.elapsed[0] - state.steps[0]), 1.0)
+            return PaperPlan(status, tuple(way.vertices), float(self.planner.horizon), 0.0)
+        remaining = max(float(self.planner.horizon) - float(state.elapsed[0] - state.steps[0]), 1.0)
         return PaperPlan(status, (*way.vertices, GOAL), *self.worth(way.vertices, remaining))
 
     def worth(self, vertices: list[str], remaining: float) -> tuple[float, float]:
@@ -146,7 +146,7 @@ class PaperPolicy:
         """
         options = [self.chaining.options[vertex] for vertex in vertices if vertex in self.chaining.options]
         if not all(option.n_successes for option in options):
-            return self.horizon, 0.0
+            return float(self.planner.horizon), 0.0
         arrived = np.zeros(TIME_BINS + 1)  # by time bin, the probability to be done with the options so far
         arrived[0] = 1.0
         for option in options:
@@ -156,7 +156,7 @@ class PaperPolicy:
                 arrived[t + delay] += option.success_rate * begun[t]
                 begun[t + delay] += (1.0 - option.success_rate) * begun[t]
         steps = sum(option.n_steps / option.n_successes for option in options)
-        return min(steps, self.horizon), float(arrived.sum())
+        return min(steps, float(self.planner.horizon)), float(arrived.sum())
 
     def links_from(self, event: str) -> list[tuple[str, str, float, float]]:
         """Return the ways from an event to others that pass no third one.
@@ -166,7 +166,7 @@ class PaperPolicy:
         """
         links = []
         for target, way in self.graph.ways_past_no_event(event).items():
-            steps, probability = self.worth(way, self.horizon)
+            steps, probability = self.worth(way, float(self.planner.horizon))
             links.append((event, target, probability, steps))
         return links
 
