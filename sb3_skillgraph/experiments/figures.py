@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 
 from sb3_skillgraph.agent import SkillGraphAgent
 from sb3_skillgraph.baselines import random_walk
-from sb3_skillgraph.envs import MazeGeometry
+from sb3_skillgraph.envs import MazeGeometry, geometry_of
 from sb3_skillgraph.experiments.plan import RunSpec
 from sb3_skillgraph.experiments.run_folder import DONE, STEPS, checkpoints, load_agent, read_json, read_progress
 from sb3_skillgraph.experiments.status import is_done
@@ -78,9 +78,9 @@ def _agent(spec: RunSpec, out: Path) -> SkillGraphAgent:
     return load_agent(saved[max(saved)], make_recommended(spec.env_id, spec.env_kwargs))
 
 
-def _geometry(spec: RunSpec) -> MazeGeometry:
+def _geometry(spec: RunSpec) -> MazeGeometry | None:
     env = make_recommended(spec.env_id, spec.env_kwargs)
-    geometry: MazeGeometry = env.get_wrapper_attr("geometry")
+    geometry = geometry_of(env)
     env.close()
     return geometry
 

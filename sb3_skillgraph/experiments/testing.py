@@ -90,7 +90,8 @@ def learn_at_test_time(learner: Learner, spec: RunSpec, result: PairsResult) -> 
     env_kwargs = {"terminate_on_success": True, **spec.env_kwargs}
     curves = []
     for pair in result.pairs[: spec.test_pairs]:
-        pinned, test = (make_recommended(spec.env_id, env_kwargs) for _ in range(2))
+        pinned = make_recommended(spec.env_id, env_kwargs)
+        test = make_recommended(spec.env_id, {**env_kwargs, **spec.test_kwargs})
         test.reset(seed=spec.seed)
         practice = Pinned(pinned, pair.start, pair.goal)
         twins = learner.practise(practice, pair.start, pair.goal, [STRETCH] * spec.test_stretches)
