@@ -41,7 +41,7 @@ from sb3_skillgraph.options.learner import OptionDDPG, OptionTD3
 
 ENV = "SkillGraph/PointMazeMedium-v0"
 SIZES = 4, 2  # of its view of a goal, and of its actions
-AGE = 5_000  # environment steps of an aged model, with as many updates
+AGE = 5_000  # environment steps of an aged model, an update after each but for the first thousand
 BUFFER = 10_000  # transitions
 CLASSES: dict[str, tuple[type[TD3], type[OptionDDPG | OptionTD3]]] = {"DDPG": (DDPG, OptionDDPG), "TD3": (TD3, OptionTD3)}
 

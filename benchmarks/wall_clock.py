@@ -105,7 +105,7 @@ def hindsight(task: Task, seed: int, seconds: float) -> BaseAlgorithm:
     """Return DDPG with hindsight that has learned for some seconds, on the same networks and minibatches."""
     settings = load_hyperparams(task.env)
     same = {name: settings[name] for name in ("batch_size", "learning_rate", "gamma", "policy_kwargs") if name in settings}
-    model = make_her(gym.make(task.env), seed=seed, **same)
+    model = make_her(gym.make(task.env, terminate_on_success=True), seed=seed, **same)
     return model.learn(10**9, callback=StopAt(seconds), log_interval=10**9)
 
 
