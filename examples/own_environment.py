@@ -20,6 +20,8 @@ class WindowCube(gym.Env[dict[str, np.ndarray], np.ndarray]):
 
     #: The agent takes the radius of its events from here (or from its argument ``event_radius``).
     distance_threshold = 0.3
+    #: Plans promise to arrive within so many steps.
+    max_steps = 100
 
     def __init__(self) -> None:
         box = spaces.Box(-1.0, 1.0, shape=(3,), dtype=np.float32)
@@ -45,7 +47,7 @@ class WindowCube(gym.Env[dict[str, np.ndarray], np.ndarray]):
         self.n_steps += 1
         success = bool(np.linalg.norm(self.point - self.goal) <= self.distance_threshold)
         # The agent learns without this reward; is_success is what SB3's callbacks report.
-        return self._observe(), float(success), False, self.n_steps >= 100, {"is_success": success}
+        return self._observe(), float(success), False, self.n_steps >= self.max_steps, {"is_success": success}
 
     def _observe(self) -> dict[str, np.ndarray]:
         return {"observation": self.point.copy(), "achieved_goal": self.point.copy(), "desired_goal": self.goal.copy()}
