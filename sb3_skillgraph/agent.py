@@ -432,7 +432,8 @@ class SkillGraphAgent(OffPolicyAlgorithm):
             running = running.begun_anew(np.asarray(episode_start, dtype=bool))
         # First end what has arrived or timed out, then begin the first option of a plan where none runs, and act
         running, runs = self.parts.runner.advance(running, batch["achieved_goal"])
-        scaled, running = self.parts.runner.act(batch, batch["desired_goal"], running)
+        goals = batch["desired_goal"]
+        scaled, running = self.parts.runner.act(batch, goals, running.pursuing(goals))
         actions = self.parts.unscale(scaled)
         return (actions if vectorized else actions[0]), running, runs
 
@@ -485,10 +486,10 @@ class SkillGraphAgent(OffPolicyAlgorithm):
         batch, _ = as_batch(obs, self.observation_space)
         if len(batch["achieved_goal"]) != 1:
             raise ValueError(f"A plan is for one environment, not for {len(batch['achieved_goal'])}.")
-        target = batch["desired_goal"][0] if goal is None else as_goal(goal, self._spec.goal_dim)
+        target = (batch["desired_goal"][0] if goal is None else as_goal(goal, self._spec.goal_dim)).astype(np.float32)
         running = self._running_state(1, state)
         running, _ = self.parts.runner.advance(running, batch["achieved_goal"])
-        return self.parts.plan(running, batch["achieved_goal"][0], target.astype(np.float32))
+        return self.parts.plan(running.pursuing(target[None]), batch["achieved_goal"][0], target)
 
     def adapt(
         self: SelfSkillGraphAgent,

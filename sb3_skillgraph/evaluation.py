@@ -3,10 +3,12 @@
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
+from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.type_aliases import PolicyPredictor
 from tqdm import tqdm
 
@@ -233,7 +235,7 @@ def evaluate_pairs(
             tested: Any = agent
             if adapt_timesteps:
                 assert made.spec is not None, "To adapt, give the environment's id, or make it by gym.make."
-                tested = tested.copy(gym.make(made.spec))
+                tested = tested.copy(make_vec_env(partial(gym.make, made.spec), tested.n_envs))
                 tested.adapt(goal, start=start, total_timesteps=adapt_timesteps)
             results.append(run_pair(tested, made, start, goal, cells))
             if tested is not agent:
@@ -242,6 +244,8 @@ def evaluate_pairs(
     finally:
         if isinstance(env, str):
             made.close()
+        elif isinstance(agent, SkillGraphAgent) and _learns_in(agent, made):
+            agent._last_obs = None  # the environment is no longer where learning has left it
 
 
 def run_pair(
@@ -263,7 +267,7 @@ def run_pair(
 def _run_pair(
     agent: PolicyPredictor, env: gym.Env, start: np.ndarray | None, goal: np.ndarray | None, cells: float
 ) -> PairResult:
-    has_reached = _judge(agent, env)
+    has_reached = judge(agent, env)
     observation, info = env.reset(options=None if goal is None else {"start": start, "goal": goal})
     start = np.array(observation["achieved_goal"]) if start is None else start
     goal = np.array(observation["desired_goal"]) if goal is None else goal
@@ -288,6 +292,11 @@ def _run_pair(
     return PairResult(start, goal, cells, success, steps, status, trace, nearest, stuck)
 
 
+def _learns_in(agent: SkillGraphAgent, env: gym.Env) -> bool:
+    """Tell whether an environment is one of an agent's own."""
+    return any(own.unwrapped is env.unwrapped for own in getattr(agent.get_env(), "envs", ()))
+
+
 @contextmanager
 def _planning_for(agent: PolicyPredictor, env: gym.Env) -> Iterator[None]:
     """Let an agent plan for the episodes of an environment: they may be longer than those that it has learned in."""
@@ -303,8 +312,12 @@ def _planning_for(agent: PolicyPredictor, env: gym.Env) -> Iterator[None]:
         planner.horizon = own
 
 
-def _judge(agent: PolicyPredictor, env: gym.Env) -> Callable[[Any, dict[str, Any]], bool]:
-    """Return what tells from an observation and an info whether the goal is reached."""
+def judge(agent: PolicyPredictor, env: gym.Env) -> Callable[[Any, dict[str, Any]], bool]:
+    """Return what tells from an observation and an info whether the goal is reached, as an environment sees it.
+
+    :param agent: its metric counts where the environment says nothing
+    :param env: a goal environment
+    """
     metric = metric_of(env)
     if metric is None:
         metric = getattr(agent, "metric", None)

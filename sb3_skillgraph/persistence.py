@@ -191,7 +191,7 @@ def _build(cls: Any, tree: dict[str, Any], env: Any, device: Any, given: dict[st
     if isinstance(noise, VectorizedActionNoise) and noise.n_envs != agent.n_envs:
         agent.action_noise = noise.base_noise
     agent._setup_model()
-    check_learned(agent, tree, agent.env)
+    check_learned(agent, tree, None if force_reset else agent.env)
     _restore(agent, tree, same_envs=agent.n_envs == tree["n_envs"] and not force_reset)
     agent._loaded = Loaded(tree["update_path"], tree["progress"]["global_generators"])
     return agent
@@ -207,7 +207,11 @@ def copy(agent: Any, env: Any) -> Any:
     agent.save(agent_file)
     agent.save_replay_buffer(replay_file)
     given = {**kept_by_name(agent._arguments), "event_radius": agent.metric}
-    twin = load(type(agent), agent_file, env, agent.device, given, force_reset=False)
+    before = generators.get_states()
+    try:
+        twin = load(type(agent), agent_file, env, agent.device, given, force_reset=False)
+    finally:
+        generators.set_states(before)  # which loading has seeded
     twin.load_replay_buffer(replay_file)
     return twin
 
@@ -313,11 +317,13 @@ def kept_by_name(arguments: dict[str, Any]) -> dict[str, Any]:
 
     :param arguments: of the constructor
     """
-    return {
-        name: value
-        for name, value in arguments.items()
-        if callable(value) or hasattr(value, "propose") or isinstance(value, Metric)
-    }
+    return {name: value for name, value in arguments.items() if _is_kept_by_name(value)}
+
+
+def _is_kept_by_name(value: Any) -> bool:
+    if isinstance(value, dict):
+        return any(_is_kept_by_name(each) for each in value.values())
+    return callable(value) or hasattr(value, "propose") or isinstance(value, Metric)
 
 
 def require_callables(arguments: Any, name: str = "") -> None:

@@ -22,7 +22,7 @@ class Plan(NamedTuple):
     :param status: the paper's three cases: ``in_graph``, the goal lies where an option has been seen to end, in an event;
         ``in_initiation_set``, near enough to an event to belong to it; ``outside``, where the agent has never been
     :param path: ids of vertices: the option that runs first, where it leads, the option from there, ..., ``"goal"``
-    :param expected_steps: environment steps to the goal, if it is reached
+    :param expected_steps: environment steps from here to the goal, if it is reached
     :param success_probability: that it is reached within the horizon, failures and replanning included
     """
 
@@ -57,9 +57,10 @@ def describe(runner: Runner, state: RunnerState, point: np.ndarray, goal: np.nda
     start = runner.start(state, 0, point)
     solution = runner.decide(state, 0, start, goal, PESSIMISTIC)
     first = solution.first() if start.towards == NOWHERE else solution.leading_to(start.towards)
-    # A running option has taken some of its steps already.
-    remaining = max(runner.planner.horizon - float(state.elapsed[0] - state.steps[0]), 1.0)
-    return _beginning_with(runner, solution, first, goal, remaining)
+    # All is counted from where the first option began: if it runs already, it has taken some of its steps.
+    taken = float(state.steps[0])
+    plan = _beginning_with(runner, solution, first, goal, max(runner.planner.horizon - float(state.elapsed[0]) + taken, 1.0))
+    return plan._replace(expected_steps=max(plan.expected_steps - taken, 1.0))
 
 
 def next_best(runner: Runner, point: np.ndarray, goal: np.ndarray) -> Plan | None:

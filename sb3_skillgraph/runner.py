@@ -152,7 +152,8 @@ class Runner:
         for i, option in enumerate(state.option.tolist() if self.skills else ()):
             if option in self.skills:
                 actions[i] = self.skills[option].actor.act(seen[i : i + 1])[0]
-        return actions, state._replace(steps=state.steps + 1, elapsed=state.elapsed + 1)
+        goal = goals.astype(np.float32)
+        return actions, state._replace(steps=state.steps + 1, elapsed=state.elapsed + 1, goal=goal)
 
     def walk(self, seen: np.ndarray, failed: np.ndarray) -> np.ndarray:
         """Let the walker act.

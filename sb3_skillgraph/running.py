@@ -5,8 +5,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_skillgraph.planning import GOAL
-
 #: Different runs of an episode that are told apart; more are counted with others that began with the same option.
 MAX_RUNS = 256
 ID = "U16"  # NumPy's type of ids
@@ -50,9 +48,11 @@ class RunnerState(NamedTuple):
     :param option: id of the running option, empty if none runs; shape ``(n_envs,)`` like all but the runs
     :param began: id of the event it began in, empty if in none
     :param aim: where it walks to, shape ``(n_envs, goal_dim)``
-    :param steps: environment steps it has run
+    :param steps: environment steps it has run, 0 if none runs
     :param timeout: environment steps it may run
-    :param arrived: id of the event that the last option has led to, where the next one begins; empty after a failure
+    :param arrived: id of the event that the last option has led to, where the next one begins, or ``goal``; empty after a
+        failure
+    :param goal: what all of this is for, shape ``(n_envs, goal_dim)``
     :param elapsed: environment steps of the episode so far
     :param seen: what was seen last, observation and achieved goal, shape ``(n_envs, observation_dim + goal_dim)``
     :param pace: by how much each entry of it changes in a step when the agent moves, same shape
@@ -71,6 +71,7 @@ class RunnerState(NamedTuple):
     steps: np.ndarray
     timeout: np.ndarray
     arrived: np.ndarray
+    goal: np.ndarray
     elapsed: np.ndarray
     seen: np.ndarray
     pace: np.ndarray
@@ -84,7 +85,7 @@ class RunnerState(NamedTuple):
 
     @property
     def failed(self) -> np.ndarray:
-        """For which environments the episode's last run ended, but not in the event it was to lead to; shape ``(n_envs,)``."""
+        """For which environments the episode's last run ended, but not where it was to lead to; shape ``(n_envs,)``."""
         return (self.arrived == "") & (self.run_option[:, 0] != "")
 
     @classmethod
@@ -93,7 +94,7 @@ class RunnerState(NamedTuple):
         ids, numbers = np.zeros(n_envs, dtype=ID), np.zeros(n_envs)
         aim, seen = np.zeros((n_envs, goal_dim), dtype=np.float32), np.zeros((n_envs, observation_dim + goal_dim))
         run_ids, run_numbers = np.zeros((n_envs, MAX_RUNS), dtype=ID), np.zeros((n_envs, MAX_RUNS))
-        running = (ids, ids, aim, numbers, numbers, ids, numbers, seen, seen, numbers)
+        running = (ids, ids, aim, numbers, numbers, ids, aim, numbers, seen, seen, numbers)
         return cls(*running, run_ids, run_ids, run_ids, run_numbers.astype(bool), run_numbers, run_numbers)
 
     def begun_anew(self, where: np.ndarray, *, same_episode: bool = False) -> "RunnerState":
@@ -108,6 +109,16 @@ class RunnerState(NamedTuple):
             fresh = fresh._replace(elapsed=self.elapsed, seen=self.seen, pace=self.pace)
         pairs = zip(fresh, self, strict=True)
         return RunnerState(*(np.where(where.reshape(-1, *[1] * (new.ndim - 1)), new, old) for new, old in pairs))
+
+    def pursuing(self, goals: np.ndarray) -> "RunnerState":
+        """Return the state in which goals are pursued: with another goal than so far an environment begins anew.
+
+        What runs was begun for the old one, and the runs straight to that tell nothing of the new one.
+
+        :param goals: shape ``(n_envs, goal_dim)``
+        """
+        changed = (self.elapsed > 0) & (self.goal != goals.astype(np.float32)).any(axis=1)
+        return self.begun_anew(changed, same_episode=True) if changed.any() else self
 
     def copy(self) -> "RunnerState":
         """Return a copy that shares no memory."""
@@ -139,8 +150,8 @@ class RunnerState(NamedTuple):
     def end(self, run: Run) -> None:
         """Write a run that has ended into the record of the episode, in place."""
         i = run.env
-        self.option[i] = ""
-        self.arrived[i] = run.landing if run.success and run.landing != GOAL else ""
+        self.option[i], self.steps[i] = "", 0
+        self.arrived[i] = run.landing if run.success else ""
         known = self.run_option[i] == run.option
         same = known & (self.run_event[i] == run.event) & (self.run_landing[i] == run.landing)
         same &= self.run_success[i] == run.success

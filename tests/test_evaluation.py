@@ -17,6 +17,8 @@ from sb3_skillgraph.envs import U_MAZE, MazeGeometry, MazeMap, find, geometry_of
 from sb3_skillgraph.evaluation import NoPairsError, PairResult, PairsResult, SkillTrace, brier_score, evaluate_pairs, run_pair
 from sb3_skillgraph.hyperparams import make_recommended
 from sb3_skillgraph.planning import DIRECT, GOAL
+from sb3_skillgraph.plotting import run_plan
+from sb3_skillgraph.running import RunnerState
 
 CORRIDOR: MazeMap = [[1] * 9, [1, "r", 0, 0, 0, 0, 0, 0, 1], [1] * 9]
 STATUSES = {"in_graph", "in_initiation_set", "outside"}
@@ -481,3 +483,78 @@ def test_plans_are_about_the_episodes_of_the_test(trained: SkillGraphAgent) -> N
     promised, promised_longer = (np.mean([trace.promised for trace in each.traces]) for each in (result, longer))
     assert promised < promised_longer
     assert abs(promised - result.success_rate) < 0.25 and abs(promised_longer - longer.success_rate) < 0.25
+
+
+# -- plans, as an episode goes on -------------------------------------------------------------------------------------
+
+
+def test_a_plan_promises_the_same_before_and_after_its_option_begins(trained: SkillGraphAgent) -> None:
+    env = gym.make(TOY, max_steps=60)
+    trained.set_env(gym.make(TOY, max_steps=60))
+    n_begun = 0
+    for seed in range(10):
+        seen, _ = env.reset(seed=seed)
+        state: Any = None
+        while not trained.metric.reached(seen["achieved_goal"], seen["desired_goal"]):
+            promised = trained.plan(seen, state=state)
+            action, state = trained.predict(seen, state=state)
+            if RunnerState(*state).steps[0] == 1:  # it has just begun
+                n_begun += 1
+                plan = trained.plan(seen, state=state)
+                assert plan.path == promised.path
+                assert plan.success_probability == pytest.approx(promised.success_probability)
+            if RunnerState(*state).elapsed[0] == 60:
+                break
+            seen, *_ = env.step(action)
+    assert n_begun > 10
+
+
+def test_the_steps_that_a_plan_expects_are_those_from_here(trained: SkillGraphAgent) -> None:
+    seen = observation(-1.0, 1.0, goal=(-1.0, -1.0))
+    before = trained.plan(seen).expected_steps
+    _, state = trained.predict(seen)
+    expected = [before]
+    for _ in range(3):
+        expected.append(trained.plan(seen, state=state).expected_steps)
+        _, state = trained.predict(seen, state=state)
+    assert np.diff(expected) == pytest.approx(-1.0, abs=0.2)
+
+
+def test_another_goal_in_the_episode_is_pursued_at_once(trained: SkillGraphAgent) -> None:
+    start = observation(-1.0, 1.0, goal=(-0.9, 1.0))
+    _, state = trained.predict(start)
+    elsewhere = {**start, "desired_goal": np.array([-1.0, -1.0])}
+    plan = trained.plan(elsewhere, state=state)
+    assert plan.path == trained.plan(elsewhere).path
+    _, state = trained.predict(elsewhere, state=state)
+    assert trained.running(state) == [plan.path[0]]
+    again = {**start, "desired_goal": np.array([-0.95, 1.0])}
+    _, state = trained.predict(again, state=state)
+    assert trained.running(state) == [DIRECT]
+    assert RunnerState(*state).aim[0] == pytest.approx([-0.95, 1.0])
+    assert RunnerState(*state).elapsed[0] == 3
+
+
+def test_testing_in_the_agents_own_environment_leaves_no_false_transition() -> None:
+    env = gym.make(TOY)
+    agent = new_agent(env, seed=0).learn(200)
+    evaluate_pairs(agent, env, n_pairs=2)
+    agent.learn(50, reset_num_timesteps=False)
+    store = agent.parts.store
+    rows = np.arange(store.total)
+    moved = store.column("next_achieved_goal", rows) - store.column("achieved_goal", rows)
+    assert np.abs(moved).max() < 0.3
+
+
+def test_an_agent_of_several_environments_is_tested_with_adaptation() -> None:
+    agent = new_agent(new_vec_env(n_envs=2), seed=0).learn(300)
+    assert len(evaluate_pairs(agent, TOY, n_pairs=1, adapt_timesteps=50).pairs) == 1
+
+
+def test_what_is_reached_is_for_the_environment_to_say(trained: SkillGraphAgent) -> None:
+    env = gym.make(TOY, success_radius=0.05)
+    start, goal = np.array([-1.0, 1.0]), np.array([-1.0, 0.8])
+    trajectory, _ = run_plan(trained, env, start, goal)
+    assert trained.metric.reached(start, goal)
+    assert len(trajectory.options) > 0
+    assert trajectory.success == (np.linalg.norm(trajectory.points[-1] - goal) <= 0.05)

@@ -184,7 +184,9 @@ def test_a_walk_to_the_goal_lands_in_the_goal() -> None:
     runner = make_runner(known_line())
     state, runs = runner.advance(running("direct", began="e0", aim=(2.0, 0.0), steps=4), np.array([[2.5, 0.0]]))
     assert [(run.landing, run.success, run.aim.tolist()) for run in runs] == [("goal", True, [2.0, 0.0])]
-    assert state.arrived[0] == ""
+    assert (state.arrived[0], state.steps[0]) == ("goal", 0)
+    assert not state.failed[0]
+    assert runner.start(state, 0, np.array([4.0, 0.0])).event == 1, "where it stands"
 
 
 class Back:

@@ -342,3 +342,61 @@ def test_what_is_in_a_file_is_all_there(trained_files: tuple[Path, Path]) -> Non
     state = state_in(*trained_files)
     assert set(state["agent"]["parameters"]) >= {"policy", "actor.optimizer", "critic.optimizer"}
     assert len(state["replay"]["columns"]["action"]) == state["agent"]["progress"]["counters"]["num_timesteps"] >= 2000
+
+
+class Trail(gym.Wrapper):
+    """Remembers where it has been, in its state: an array that grows."""
+
+    def __init__(self, env: gym.Env) -> None:
+        super().__init__(env)
+        self.trail: list[np.ndarray] = []
+
+    def step(self, action: Any) -> Any:
+        result = self.env.step(action)
+        self.trail.append(result[0]["achieved_goal"])
+        return result
+
+    def get_state(self) -> dict[str, Any]:
+        return {**self.env.get_wrapper_attr("get_state")(), "trail": np.array(self.trail).reshape(-1, 2)}
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        self.trail = list(state["trail"])
+        self.env.get_wrapper_attr("set_state")({name: value for name, value in state.items() if name != "trail"})
+
+
+def test_an_environments_state_may_grow(tmp_path: Path) -> None:
+    agent = new_agent(Trail(gym.make(TOY))).learn(120)
+    agent.save(tmp_path / "agent")
+    for force_reset in (True, False):
+        loaded = SkillGraphAgent.load(tmp_path / "agent", env=Trail(gym.make(TOY)), force_reset=force_reset)
+        loaded.load_replay_buffer(saved_replay(agent, tmp_path))
+        loaded.learn(10, reset_num_timesteps=False)
+        (trail,) = loaded.get_env().get_attr("trail")
+        assert len(trail) == 10 + (0 if force_reset else 120)
+    assert agent.copy(Trail(gym.make(TOY))).num_timesteps == 120
+
+
+def saved_replay(agent: SkillGraphAgent, folder: Path) -> Path:
+    agent.save_replay_buffer(folder / "replay")
+    return folder / "replay"
+
+
+def test_what_was_saved_while_adapting_does_not_go_on_adapting(tmp_path: Path) -> None:
+    agent = new_agent(seed=0).learn(300)
+    goal = np.array([1.0, -1.0])
+
+    def save(locals_: dict[str, Any], _: Any) -> bool:
+        if agent.num_timesteps == 350:
+            assert agent.parts.missions.pinned is not None
+            agent.save(tmp_path / "agent")
+        return True
+
+    agent.adapt(goal, total_timesteps=100, callback=save)
+    assert SkillGraphAgent.load(tmp_path / "agent", env=gym.make(TOY)).parts.missions.pinned is None
+
+
+def test_a_copy_leaves_the_process_as_it_was() -> None:
+    agent = new_agent(seed=0, option_kwargs={"actor_learning_rate": lambda progress: 1e-3}).learn(150)
+    before = (random.getstate(), np.random.get_state(), th.get_rng_state())  # noqa: NPY002
+    agent.copy(gym.make(TOY))
+    assert differences(before, (random.getstate(), np.random.get_state(), th.get_rng_state())) == []  # noqa: NPY002

@@ -125,12 +125,11 @@ class Agenda(ABC):
     def get_state(self) -> dict[str, Any]:
         """Return the missions as plain data."""
         current = [None if mission is None else asdict(mission) for mission in self.current]
-        return {"current": current, "pinned": self.pinned}
+        return {"current": current}
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Restore what :meth:`get_state` returned."""
         self.current = [None if spec is None else Mission(**spec) for spec in state["current"]]
-        self.pinned = state["pinned"]
 
 
 class Missions(Agenda):

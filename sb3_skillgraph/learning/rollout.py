@@ -10,7 +10,7 @@ from sb3_skillgraph.learning.missions import Agenda, Mission
 from sb3_skillgraph.learning.scale import Scale
 from sb3_skillgraph.learning.witness import Witness
 from sb3_skillgraph.memory.store import TransitionStore
-from sb3_skillgraph.planning import DIRECT
+from sb3_skillgraph.planning import DIRECT, GOAL
 from sb3_skillgraph.runner import Runner
 from sb3_skillgraph.running import RunnerState
 
@@ -128,7 +128,8 @@ class Rollout:
         for i in idle:
             mission = missions[i]
             aim = mission.goal if mission.beyond is None else mission.beyond
-            state.begin(i, DIRECT, str(state.arrived[i]), aim, mission.explore_steps)
+            event = "" if state.arrived[i] == GOAL else str(state.arrived[i])
+            state.begin(i, DIRECT, event, aim, mission.explore_steps)
         return state
 
     def with_noise(

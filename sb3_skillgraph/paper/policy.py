@@ -133,8 +133,9 @@ class PaperPolicy:
             return PaperPlan(status, (), float(self.planner.horizon), 0.0)
         if not way.at_goal:
             return PaperPlan(status, tuple(way.vertices), float(self.planner.horizon), 0.0)
-        remaining = max(float(self.planner.horizon) - float(state.elapsed[0] - state.steps[0]), 1.0)
-        return PaperPlan(status, (*way.vertices, GOAL), *self.worth(way.vertices, remaining))
+        taken = float(state.steps[0])
+        steps, probability = self.worth(way.vertices, max(self.planner.horizon - float(state.elapsed[0]) + taken, 1.0))
+        return PaperPlan(status, (*way.vertices, GOAL), max(steps - taken, 1.0), probability)
 
     def worth(self, vertices: list[str], remaining: float) -> tuple[float, float]:
         """Tell what a way is worth, if a failed option is run again.

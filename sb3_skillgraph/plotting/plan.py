@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 
 from sb3_skillgraph.agent import SkillGraphAgent
 from sb3_skillgraph.envs import MazeGeometry
+from sb3_skillgraph.evaluation import judge
 from sb3_skillgraph.plan import Plan
 from sb3_skillgraph.planning import DIRECT
 from sb3_skillgraph.plotting import figures
@@ -70,7 +71,7 @@ def run_plan(
     points = [np.array(observation["achieved_goal"], dtype=np.float64)]
     steps = list(follow(agent, env, observation))
     points += [step.point for step in steps]
-    reached = agent.metric.reached(points[-1], target)
+    reached = steps[-1].reached if steps else True  # it was there from the beginning
     return Trajectory(np.stack(points), [step.option for step in steps], target, reached), plan
 
 
@@ -83,15 +84,15 @@ def follow(agent: SkillGraphAgent, env: gym.Env, observation: dict[str, np.ndarr
     :return: the steps; none if the agent is there from the beginning
     """
     goal = observation["desired_goal"]
-    target = np.array(goal, dtype=np.float64)
+    has_reached = judge(agent, env)
     state: tuple[np.ndarray, ...] | None = None
-    over = agent.metric.reached(np.array(observation["achieved_goal"], dtype=np.float64), target)
+    over = has_reached(observation, {})
     while not over:
         action, state = agent.predict({**observation, "desired_goal": goal}, state=state, deterministic=True)
         assert state is not None
         observation, _, terminated, truncated, info = env.step(action)
         point = np.array(observation["achieved_goal"], dtype=np.float64)
-        reached = agent.metric.reached(point, target)
+        reached = has_reached({**observation, "desired_goal": goal}, info)
         over = reached or terminated or truncated or bool(info.get("stuck"))
         yield FollowedStep(point, agent.running(state)[0], over, reached)
 

@@ -176,4 +176,5 @@ class WalkActions:
         """A step was taken: nothing runs, and the agent is where it finds itself."""
         none = np.zeros_like(self.state.arrived)
         elapsed = self.state.elapsed + (self.state.option == "")  # else the walker took it
-        self.state = self.state._replace(option=none, arrived=none, elapsed=elapsed)
+        steps = np.zeros_like(self.state.steps)
+        self.state = self.state._replace(option=none, arrived=none, steps=steps, elapsed=elapsed)
