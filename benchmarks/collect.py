@@ -22,7 +22,7 @@ import numpy as np
 from scipy import stats
 
 from benchmarks.shortest import Shortest
-from sb3_skillgraph.evaluation import brier_score, calibration
+from sb3_skillgraph.calibration import brier_score, calibration
 from sb3_skillgraph.experiments.plan import RunSpec, load_plan
 from sb3_skillgraph.experiments.run_folder import CONFIG, DONE, SECONDS, STEPS, read_json, read_progress
 from sb3_skillgraph.experiments.status import status

@@ -19,7 +19,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 from stable_baselines3.td3.policies import MultiInputPolicy
 
 from sb3_skillgraph import persistence
-from sb3_skillgraph.arguments import check_arguments, check_attributes, horizon
+from sb3_skillgraph.arguments import check_arguments, check_attributes, time_limit
 from sb3_skillgraph.events import Event
 from sb3_skillgraph.goal_env import GoalSpec, as_batch, as_goal, check_finite, refuse_changed_goals, rows, with_terminal
 from sb3_skillgraph.interrupts import Interrupts
@@ -194,6 +194,7 @@ class SkillGraphAgent(OffPolicyAlgorithm):
         self._convert_train_freq()
         self._spec = GoalSpec.of(self.observation_space, self.action_space)
         self.parts = self._build_parts()
+        self._heed_time_limit()
         # Under SB3's names as well: CheckpointCallback looks for the one, users for the other.
         self.replay_buffer = self.parts.store
         self.policy = self.parts.walker.learner.policy
@@ -212,6 +213,13 @@ class SkillGraphAgent(OffPolicyAlgorithm):
         from sb3_skillgraph.paper.parts import PaperParts  # when it is used: networkx takes a while to import
 
         return PaperParts.build(self, self._spec, self._arguments)
+
+    def _heed_time_limit(self) -> None:
+        """Make plans for the episodes of the environment: as long as it tells, else as those that it cuts while learning."""
+        limit = time_limit(self.env)
+        self.parts.rollout.is_told_limit = limit is not None
+        if limit is not None:
+            self.parts.planner.horizon = limit
 
     # -- what it knows ------------------------------------------------------------------------------------------------
 
@@ -629,6 +637,6 @@ class SkillGraphAgent(OffPolicyAlgorithm):
         """
         refuse_changed_goals(env)
         super().set_env(env, force_reset)
-        self.parts.planner.horizon = horizon(self.env)
+        self._heed_time_limit()
         if force_reset:
             self._env_snapshot, self._loaded = None, None

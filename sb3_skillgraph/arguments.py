@@ -28,7 +28,7 @@ NET_ARCH = [128, 128]  # of the walker's networks
 #: Weight, in the loss of ``OptionDDPG``'s and ``OptionTD3``'s actors, of the mean squared norm of what their tanh is given:
 #: keeps them from getting stuck at the bounds of the actions (success on Medium 0.96 with it, 0.61 without).
 SATURATION_PENALTY = 1e-4
-#: Environment steps within which a goal is to be reached, where the environment names no time limit.
+#: Environment steps within which a goal is to be reached, where the environment has shown no time limit.
 HORIZON = 1_000
 SKILLS = ("where_needed", "always", "never")  # when walks get a network of their own
 OPTION_CLASSES: dict[str, type[OffPolicyAlgorithm]] = {cls.__name__: cls for cls in (OptionDDPG, OptionTD3, DDPG, TD3, SAC)}
@@ -148,13 +148,13 @@ def goal_metric(given: Any, env: VecEnv | None, goal_dim: int) -> Metric:
     return metric
 
 
-def horizon(env: VecEnv | None) -> int:
-    """Return an environment's time limit, by the names in use.
+def time_limit(env: VecEnv | None) -> int | None:
+    """Return after how many steps an environment truncates an episode, by the names in use; None if it does not tell.
 
     :param env: the environment
     """
     limits = [] if env is None else [env_attribute(env, name) for name in TIME_LIMITS]
-    return min((int(limit) for limit in limits if limit), default=HORIZON)
+    return min((int(limit) for limit in limits if limit), default=None)
 
 
 def option_kwargs(agent: OffPolicyAlgorithm, arguments: dict[str, Any]) -> dict[str, Any]:

@@ -7,7 +7,7 @@ import numpy as np
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_skillgraph.arguments import box, find_salience, goal_metric, horizon, option_class, option_kwargs
+from sb3_skillgraph.arguments import HORIZON, box, find_salience, goal_metric, option_class, option_kwargs
 from sb3_skillgraph.goal_env import GoalSpec, find_view
 from sb3_skillgraph.graph import SkillGraph
 from sb3_skillgraph.learning.growth import Growth, Skills
@@ -127,7 +127,7 @@ class Parts:
         rng, view_name, view, store, factory, walker, metric = common
         graph = SkillGraph(spec.goal_dim, metric, arguments["max_events"], arguments["walk_steps"])
         model = WalkModel(metric.n_matched)
-        planner = Planner(graph, model, horizon(agent.env))
+        planner = Planner(graph, model, HORIZON)
         skills = Skills(graph, factory, walker)
         average = AveragedPolicy(walker.learner)  # what predict acts by
         runner = Runner(graph, planner, average.actor, view, skills, second=walker.actor)

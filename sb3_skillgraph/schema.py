@@ -254,6 +254,7 @@ def _rollout(n_envs: int, spec: Any, n_events: int, n_matched: int) -> Check:
         n_stuck=whole(),
         ran=dict_of(whole()),
         n_steps=whole(),
+        longest=whole(),
         missions=entries(current=list_of(optional(mission), n_envs)),
         witness=entries(
             samples=at_most(N_SAMPLES, array((None, 4 + n_matched), low=0.0)),

@@ -18,6 +18,7 @@ FLOORS: dict[str, float] = {
     "rules": 0,  # numbers
     "vec_env": 0,
     "generators": 0,
+    "calibration": 0,
     "metric_parts": 0.05,
     "metric": 0.1,  # knows how large numbers may be
     "events": 0.5,

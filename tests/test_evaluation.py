@@ -13,8 +13,9 @@ from conftest import POINT, TOY, Recorder, check_store, differences, new_agent, 
 import sb3_skillgraph
 from sb3_skillgraph import SkillGraphAgent
 from sb3_skillgraph.baselines import StraightOn
+from sb3_skillgraph.calibration import brier_score
 from sb3_skillgraph.envs import U_MAZE, MazeGeometry, MazeMap, find, geometry_of
-from sb3_skillgraph.evaluation import NoPairsError, PairResult, PairsResult, SkillTrace, brier_score, evaluate_pairs, run_pair
+from sb3_skillgraph.evaluation import NoPairsError, PairResult, PairsResult, SkillTrace, evaluate_pairs, run_pair
 from sb3_skillgraph.hyperparams import make_recommended
 from sb3_skillgraph.planning import DIRECT, GOAL
 from sb3_skillgraph.plotting import run_plan

@@ -13,6 +13,8 @@ import numpy as np
 import pytest
 import torch as th
 from conftest import TOY, differences, new_agent, new_vec_env, state_in, state_of
+from gymnasium import spaces
+from gymnasium.wrappers import TimeLimit
 from stable_baselines3 import SAC
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise, VectorizedActionNoise
 from stable_baselines3.common.utils import set_random_seed
@@ -342,6 +344,40 @@ def test_what_is_in_a_file_is_all_there(trained_files: tuple[Path, Path]) -> Non
     state = state_in(*trained_files)
     assert set(state["agent"]["parameters"]) >= {"policy", "actor.optimizer", "critic.optimizer"}
     assert len(state["replay"]["columns"]["action"]) == state["agent"]["progress"]["counters"]["num_timesteps"] >= 2000
+
+
+class Untold(gym.Env):
+    """A point in a square; episodes have 30 steps, and nothing says so."""
+
+    distance_threshold = 0.3
+
+    def __init__(self) -> None:
+        box = spaces.Box(-3.0, 3.0, (2,), np.float32)
+        self.observation_space = spaces.Dict({"observation": box, "achieved_goal": box, "desired_goal": box})
+        self.action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
+
+    def reset(self, **kwargs: Any) -> Any:
+        super().reset(**kwargs)
+        self.n_steps = 0
+        self.point, self.goal = self.np_random.uniform(-3, 3, (2, 2)).astype(np.float32)
+        return self._seen(), {}
+
+    def step(self, action: np.ndarray) -> Any:
+        self.n_steps += 1
+        self.point = np.clip(self.point + 0.1 * action, -3.0, 3.0).astype(np.float32)
+        return self._seen(), 0.0, False, self.n_steps >= 30, {}
+
+    def _seen(self) -> dict[str, np.ndarray]:
+        return {"observation": self.point, "achieved_goal": self.point, "desired_goal": self.goal}
+
+
+def test_how_long_episodes_are_is_learned_where_the_environment_does_not_tell(tmp_path: Path) -> None:
+    agent = new_agent(Untold())
+    assert agent.parts.planner.horizon == 1_000
+    agent.learn(100).save(tmp_path / "agent")
+    for env in (None, Untold()):
+        assert SkillGraphAgent.load(tmp_path / "agent", env=env).parts.planner.horizon == 30
+    assert SkillGraphAgent.load(tmp_path / "agent", env=TimeLimit(Untold(), 20)).parts.planner.horizon == 20
 
 
 class Trail(gym.Wrapper):

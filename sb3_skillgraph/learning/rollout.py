@@ -63,6 +63,8 @@ class Rollout:
         self.rng = rng
         self.pending: Step | None = None
         self.n_stuck = 0  # episodes given up
+        self.longest = 0  # steps of the longest episode that was cut
+        self.is_told_limit = False  # whether the environment says how long episodes are
         self.scale: Scale | None = Scale(runner.graph.metric)  # until it has told
         self.ran: dict[str, int] = {}  # environment steps of each skill since there was training
         self.n_steps = 0  # and of all together
@@ -196,6 +198,11 @@ class Rollout:
         if self.scale is not None and self.scale.observe(step.observation["achieved_goal"], points, dones):
             self.scale.tell()
             self.scale = None
+        cut = dones & ~terminated & ~stuck
+        if cut.any():
+            self.longest = max(self.longest, int(step.state.elapsed[cut].max()))
+            if not self.is_told_limit:
+                self.runner.planner.horizon = self.longest
         # Which options have begun with this step, and which have ended
         for i in np.flatnonzero(step.state.steps == 1).tolist():
             self.witness.began(i, step.observation["achieved_goal"][i])
@@ -231,7 +238,7 @@ class Rollout:
     def get_state(self) -> dict[str, Any]:
         """Return what the environments are in the middle of, as plain data."""
         state = {"runner": tuple(self.state), "held": self.held, "hold_left": self.hold_left, "n_stuck": self.n_stuck}
-        state |= {"ran": self.ran, "n_steps": self.n_steps}
+        state |= {"ran": self.ran, "n_steps": self.n_steps, "longest": self.longest}
         return {**state, "missions": self.missions.get_state(), "witness": self.witness.get_state()}
 
     def set_state(self, state: dict[str, Any], same_envs: bool) -> None:
@@ -241,6 +248,7 @@ class Rollout:
         :param same_envs: whether the environments go on where they were; else they begin anew
         """
         self.n_stuck, self.ran, self.n_steps = state["n_stuck"], dict(state["ran"]), state["n_steps"]
+        self.longest = state["longest"]
         self.witness.set_state(state["witness"])
         self.missions.set_state(state["missions"])
         if not same_envs:

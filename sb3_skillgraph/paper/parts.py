@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_skillgraph.arguments import find_salience, horizon
+from sb3_skillgraph.arguments import HORIZON, find_salience
 from sb3_skillgraph.edges import NOWHERE
 from sb3_skillgraph.goal_env import GoalSpec
 from sb3_skillgraph.metric import Ball
@@ -52,7 +52,7 @@ class PaperParts(Parts):
         graph = PaperGraph(spec.goal_dim, metric, arguments["walk_steps"])
         chaining = DeepSkillChaining(graph, factory.make, rules.gestation_period)
         model = WalkModel()
-        planner = Planner(graph, model, horizon(agent.env))  # never asked: the rules choose
+        planner = Planner(graph, model, HORIZON)  # never asked: the rules choose
         policy = PaperPolicy(graph, chaining, rules.timeout, planner)
         runner = Runner(graph, planner, walker.actor, view, chaining.options, policy)
         salience = find_salience(arguments, graph, store, agent, relearn=1)
