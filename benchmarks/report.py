@@ -241,7 +241,8 @@ def wall_clock() -> str:
     parts = []
     for name, runs in tasks.items():
         seconds = ", ".join(f"{run['seconds']:.0f}" for run in runs)
-        parts.append(f"{name} {seconds} s ({', '.join(number(run['her']) for run in runs)})")
+        hindsight = f" ({', '.join(number(run['her']) for run in runs)})" if all("her" in run for run in runs) else ""
+        parts.append(f"{name} {seconds} s{hindsight}")
     return "; ".join(parts)
 
 
