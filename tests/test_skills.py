@@ -252,6 +252,8 @@ def test_growth_is_saved_and_goes_on_exactly(skills: Literal["where_needed", "al
         trial.runs(2 * ENOUGH_RUNS + GESTATION - 1, 0)
         trial.growth._suspects.add(agent.graph.walk_ids[0])
         trial.growth._again[agent.graph.walk_ids[0]] = 1e6
+    else:  # whichever has run
+        trial.walk = next(iter(agent.parts.skills))
     assert trial.has_skill
     agent.save(tmp_path / "agent")
     agent.save_replay_buffer(tmp_path / "replay")

@@ -246,7 +246,7 @@ def draw(buffer: ReplayBuffer, batch_size: int, env: VecNormalize | None) -> Min
         at = at * n_envs + np.random.randint(0, n_envs, size=batch_size)  # noqa: NPY002
 
     def rows(column: np.ndarray) -> np.ndarray:
-        return column.reshape(len(column) * n_envs, -1).take(at, axis=0)
+        return column.reshape(len(column) * n_envs, *(column.shape[2:] or (1,))).take(at, axis=0)
 
     dones = rows(buffer.dones) * (1 - rows(buffer.timeouts))
     seen = rows(buffer.observations), rows(buffer.actions), rows(buffer.next_observations)
