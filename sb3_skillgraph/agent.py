@@ -2,6 +2,7 @@
 
 import copy
 from collections.abc import Iterable, Sequence
+from functools import partial
 from inspect import signature
 from typing import Any, ClassVar, Literal, TypeVar
 
@@ -19,9 +20,19 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 from stable_baselines3.td3.policies import MultiInputPolicy
 
 from sb3_skillgraph import persistence
-from sb3_skillgraph.arguments import check_arguments, check_attributes, time_limit
+from sb3_skillgraph.arguments import check_arguments, check_attributes
+from sb3_skillgraph.envs.wrappers import told_limit
 from sb3_skillgraph.events import Event
-from sb3_skillgraph.goal_env import GoalSpec, as_batch, as_goal, check_finite, refuse_changed_goals, rows, with_terminal
+from sb3_skillgraph.goal_env import (
+    GoalSpec,
+    as_batch,
+    as_goal,
+    check_finite,
+    env_attribute,
+    refuse_changed_goals,
+    rows,
+    with_terminal,
+)
 from sb3_skillgraph.interrupts import Interrupts
 from sb3_skillgraph.learning.episodes import Episodes
 from sb3_skillgraph.learning.salience import Salience
@@ -216,7 +227,7 @@ class SkillGraphAgent(OffPolicyAlgorithm):
 
     def _heed_time_limit(self) -> None:
         """Make plans for the episodes of the environment: as long as it tells, else as those that it cuts while learning."""
-        limit = time_limit(self.env)
+        limit = None if self.env is None else told_limit(partial(env_attribute, self.env))
         self.parts.rollout.is_told_limit = limit is not None
         if limit is not None:
             self.parts.planner.horizon = limit

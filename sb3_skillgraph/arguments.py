@@ -11,7 +11,6 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import TrainFreq
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_skillgraph.envs.wrappers import TIME_LIMITS
 from sb3_skillgraph.goal_env import Oracle, env_attribute, env_metric
 from sb3_skillgraph.graph import SkillGraph
 from sb3_skillgraph.learning.dco import LEARN_EVERY, DCOSalience
@@ -146,15 +145,6 @@ def goal_metric(given: Any, env: VecEnv | None, goal_dim: int) -> Metric:
         )
     metric.check(goal_dim)
     return metric
-
-
-def time_limit(env: VecEnv | None) -> int | None:
-    """Return after how many steps an environment truncates an episode, by the names in use; None if it does not tell.
-
-    :param env: the environment
-    """
-    limits = [] if env is None else [env_attribute(env, name) for name in TIME_LIMITS]
-    return min((int(limit) for limit in limits if limit), default=None)
 
 
 def option_kwargs(agent: OffPolicyAlgorithm, arguments: dict[str, Any]) -> dict[str, Any]:

@@ -222,8 +222,8 @@ def _restore(agent: Any, tree: dict[str, Any], same_envs: bool) -> None:
     parts.walker.learner._n_updates = tree["walker"]
     agent.set_parameters(tree["parameters"], exact_match=True, device=agent.device)
     parts.set_state(tree)
-    parts.planner.horizon = tree["horizon"]
-    agent._heed_time_limit()
+    if not parts.rollout.is_told_limit:
+        parts.planner.horizon = tree["horizon"]
     progress = tree["progress"]
     for name in _COUNTERS:
         setattr(agent, name, progress["counters"][name])

@@ -57,10 +57,26 @@ def describe(runner: Runner, state: RunnerState, point: np.ndarray, goal: np.nda
     start = runner.start(state, 0, point)
     solution = runner.decide(state, 0, start, goal, PESSIMISTIC)
     first = solution.first() if start.towards == NOWHERE else solution.leading_to(start.towards)
-    # All is counted from where the first option began: if it runs already, it has taken some of its steps.
-    taken = float(state.steps[0])
-    plan = _beginning_with(runner, solution, first, goal, max(runner.planner.horizon - float(state.elapsed[0]) + taken, 1.0))
-    return plan._replace(expected_steps=max(plan.expected_steps - taken, 1.0))
+    plan = _beginning_with(runner, solution, first, goal, remaining_steps(state, runner.planner.horizon))
+    return plan._replace(expected_steps=from_here(state, plan.expected_steps))
+
+
+def remaining_steps(state: RunnerState, horizon: int) -> float:
+    """Return the environment steps that are left from where the first option began: if it runs, it has taken some of its own.
+
+    :param state: of one environment
+    :param horizon: environment steps of an episode
+    """
+    return max(horizon - float(state.elapsed[0] - state.steps[0]), 1.0)
+
+
+def from_here(state: RunnerState, steps: float) -> float:
+    """Return the environment steps from here, 1 at least.
+
+    :param state: of one environment
+    :param steps: those from where the first option began
+    """
+    return max(steps - float(state.steps[0]), 1.0)
 
 
 def next_best(runner: Runner, point: np.ndarray, goal: np.ndarray) -> Plan | None:

@@ -19,8 +19,15 @@ def time_limit(env: gym.Env) -> int | None:
 
     :param env: any environment
     """
-    limits = [env.get_wrapper_attr(name) for name in TIME_LIMITS if env.has_wrapper_attr(name)]
-    return min((int(limit) for limit in limits if limit), default=None)
+    return told_limit(lambda name: env.get_wrapper_attr(name) if env.has_wrapper_attr(name) else None)
+
+
+def told_limit(get: Callable[[str], Any]) -> int | None:
+    """Return a time limit by the names in use, the least of several; None if there is none.
+
+    :param get: returns an attribute of the environment, None if it has none
+    """
+    return min((int(limit) for limit in map(get, TIME_LIMITS) if limit), default=None)
 
 
 class HoldAction(gym.Wrapper, gym.utils.RecordConstructorArgs):

@@ -8,7 +8,7 @@ import numpy as np
 from sb3_skillgraph.options.option import Option
 from sb3_skillgraph.paper.chaining import DeepSkillChaining
 from sb3_skillgraph.paper.graph import PaperGraph
-from sb3_skillgraph.plan import Plan, Status
+from sb3_skillgraph.plan import Plan, Status, from_here, remaining_steps
 from sb3_skillgraph.planning import DIRECT, GOAL, TIME_BINS, Planner
 from sb3_skillgraph.runner import Chosen
 from sb3_skillgraph.running import RunnerState
@@ -45,6 +45,10 @@ class PaperPolicy:
         self.chaining = chaining
         self.timeout = timeout
         self.planner = planner
+
+    @property
+    def _horizon(self) -> float:
+        return float(self.planner.horizon)
 
     def choose(self, state: RunnerState, i: int, point: np.ndarray, goal: np.ndarray, stance: float) -> Chosen:
         """Choose the option that runs next.
@@ -130,12 +134,11 @@ class PaperPolicy:
         """
         way, status = self.way(state, 0, point, goal), self._status(goal)
         if way is None:
-            return PaperPlan(status, (), float(self.planner.horizon), 0.0)
+            return PaperPlan(status, (), self._horizon, 0.0)
         if not way.at_goal:
-            return PaperPlan(status, tuple(way.vertices), float(self.planner.horizon), 0.0)
-        taken = float(state.steps[0])
-        steps, probability = self.worth(way.vertices, max(self.planner.horizon - float(state.elapsed[0]) + taken, 1.0))
-        return PaperPlan(status, (*way.vertices, GOAL), max(steps - taken, 1.0), probability)
+            return PaperPlan(status, tuple(way.vertices), self._horizon, 0.0)
+        steps, probability = self.worth(way.vertices, remaining_steps(state, self.planner.horizon))
+        return PaperPlan(status, (*way.vertices, GOAL), from_here(state, steps), probability)
 
     def worth(self, vertices: list[str], remaining: float) -> tuple[float, float]:
         """Tell what a way is worth, if a failed option is run again.
@@ -147,7 +150,7 @@ class PaperPolicy:
         """
         options = [self.chaining.options[vertex] for vertex in vertices if vertex in self.chaining.options]
         if not all(option.n_successes for option in options):
-            return float(self.planner.horizon), 0.0
+            return self._horizon, 0.0
         arrived = np.zeros(TIME_BINS + 1)  # by time bin, the probability to be done with the options so far
         arrived[0] = 1.0
         for option in options:
@@ -157,7 +160,7 @@ class PaperPolicy:
                 arrived[t + delay] += option.success_rate * begun[t]
                 begun[t + delay] += (1.0 - option.success_rate) * begun[t]
         steps = sum(option.n_steps / option.n_successes for option in options)
-        return min(steps, float(self.planner.horizon)), float(arrived.sum())
+        return min(steps, self._horizon), float(arrived.sum())
 
     def links_from(self, event: str) -> list[tuple[str, str, float, float]]:
         """Return the ways from an event to others that pass no third one.
@@ -167,7 +170,7 @@ class PaperPolicy:
         """
         links = []
         for target, way in self.graph.ways_past_no_event(event).items():
-            steps, probability = self.worth(way, float(self.planner.horizon))
+            steps, probability = self.worth(way, self._horizon)
             links.append((event, target, probability, steps))
         return links
 
