@@ -6,9 +6,9 @@ over the turns. *Fresh* models have just been built, their buffer full of noise.
 SB3 has trained in 5000 steps of a ``SkillGraphAgent`` on PointMaze, their buffer full of its minibatches: many units have
 died, and Adam's moments of dead units have decayed into denormal numbers, which many processors are slow at.
 
-Beside them, and in turn with them, the matrix products that the kernel's update cannot do without: by the same BLAS, the
-weights where they are. On a GPU (``--device cuda``), where there is no kernel, only SB3's and torch's updates are compared,
-fresh.
+Beside them, and in turn with them, the matrix products that the kernel's update cannot do without: a plain call of the same
+BLAS each, the weights where they are. On a GPU (``--device cuda``), where there is no kernel, only SB3's and torch's updates
+are compared, fresh.
 
 Run it with ``OMP_NUM_THREADS=1 python -m benchmarks.update --out benchmarks/results/update.json``.
 """
@@ -36,7 +36,7 @@ from stable_baselines3.common.logger import Logger
 from torch import nn
 
 from sb3_skillgraph import SkillGraphAgent
-from sb3_skillgraph.options.blas import product
+from sb3_skillgraph.options.blas import multiply
 from sb3_skillgraph.options.learner import OptionDDPG, OptionTD3
 
 ENV = "SkillGraph/PointMazeMedium-v0"
@@ -163,7 +163,7 @@ def layer_by_layer(weights: list[np.ndarray], inputs: np.ndarray) -> list[np.nda
     """Multiply on the way forward: return what every layer is given, and last what the network returns."""
     values = [inputs]
     for weight in weights:
-        values.append(product(values[-1], weight, False, True))
+        values.append(multiply(values[-1], weight, False, True))
     return values
 
 
@@ -173,9 +173,9 @@ def back(weights: list[np.ndarray], values: list[np.ndarray], learns: bool, to_i
     gradient = values[-1]
     for layer in range(len(weights) - 1, -1, -1):
         if learns:
-            product(gradient, values[layer], True, False)
+            multiply(gradient, values[layer], True, False)
         if layer > 0 or to_inputs:
-            gradient = product(gradient, weights[layer], False, False)
+            gradient = multiply(gradient, weights[layer], False, False)
 
 
 @njit
@@ -227,11 +227,11 @@ def multiplier(model: TD3, batch_size: int) -> Callable[[], None]:
     pairs = zip(model.critic.q_networks, model.critic_target.q_networks, strict=True)
     critics = List([List([weights(network) for network in pair]) for pair in pairs])
 
-    def multiply() -> None:
+    def multiply_twice() -> None:
         products(actor, critics, seen, valued, True)
         products(actor, critics, seen, valued, model.policy_delay == 1)
 
-    return multiply
+    return multiply_twice
 
 
 def measure(case: Case, ages: dict[str, dict[str, TD3]], repeats: int) -> dict[str, dict[str, float]]:

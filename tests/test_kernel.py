@@ -343,7 +343,7 @@ def multiply(left, right, left_turned, right_turned):
 @pytest.mark.parametrize("right_turned", [False, True])
 def test_products(left_turned, right_turned):
     rng = np.random.default_rng(0)
-    for m, k, n in ((1, 1, 1), (2, 3, 4), (64, 27, 1), (7, 130, 33)):
+    for m, k, n in ((1, 1, 1), (2, 3, 4), (64, 27, 1), (64, 27, 12), (7, 130, 33)):
         left, right = rng.normal(size=(m, k)).astype(np.float32), rng.normal(size=(k, n)).astype(np.float32)
         given = [np.ascontiguousarray(x.T) if turned else x for x, turned in ((left, left_turned), (right, right_turned))]
         result = multiply(*given, left_turned, right_turned)
