@@ -183,8 +183,6 @@ class SkillGraphAgent(OffPolicyAlgorithm):
         self._interrupts = Interrupts()
         self._env_snapshot: dict[str, Any] | None = None
         self._loaded: persistence.Loaded | None = None  # until it is put to use
-        if self.env is not None:
-            self._spec = GoalSpec.of(self.observation_space, self.action_space)
         if _init_setup_model:
             self._setup_model()
 
@@ -220,10 +218,10 @@ class SkillGraphAgent(OffPolicyAlgorithm):
 
     def _build_parts(self) -> Any:
         if self.rules is None:
-            return Parts.build(self, self._spec, self._arguments)
+            return Parts(self, self._spec, self._arguments)
         from sb3_skillgraph.paper.parts import PaperParts  # when it is used: networkx takes a while to import
 
-        return PaperParts.build(self, self._spec, self._arguments)
+        return PaperParts(self, self._spec, self._arguments)
 
     def _heed_time_limit(self) -> None:
         """Make plans for the episodes of the environment: as long as it tells, else as those that it cuts while learning."""
@@ -381,7 +379,7 @@ class SkillGraphAgent(OffPolicyAlgorithm):
             if n_updates > 0 and option.replay.size() >= batch_size:
                 self._train(option.learner, n_updates, batch_size)
         # What predict acts by follows
-        self.parts.learned(gradient_steps)
+        self.parts.average.follow(gradient_steps)
         self._n_updates += gradient_steps
         self.graph.now = float(self._n_updates)  # records age as the walker learns
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
@@ -647,6 +645,12 @@ class SkillGraphAgent(OffPolicyAlgorithm):
         :raises ValueError: if the environment does not fit, or is normalised by VecNormalize
         """
         refuse_changed_goals(env)
+        env = self._wrap_env(env, self.verbose)
+        if env.num_envs != self.n_envs:
+            raise ValueError(
+                f"set_env takes as many environments as the agent has, {self.n_envs}, not {env.num_envs}: load(path, env=env) "
+                "takes any number."
+            )
         super().set_env(env, force_reset)
         self._heed_time_limit()
         if force_reset:

@@ -14,11 +14,46 @@ RECORD = ("successes", "success_steps", "failures", "failure_steps")
 _NUMBERS = ("forward", "backward", "crossing_steps", *RECORD, "updated")
 
 
+class _Column:
+    """What is known of all edges: a view of an array that grows."""
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self.name = name
+
+    def __get__(self, edges: "Edges", owner: type) -> np.ndarray:
+        return edges._arrays[self.name][: edges.size]
+
+
 class Edges:
     """Which options can be begun in which events, and how they did: one row for each pair.
 
     The columns are views of arrays that grow: what is written into them is kept, until :meth:`add` or :meth:`keep`.
     """
+
+    #: Index of the event that the option is begun in, shape ``(n_edges,)`` like all that follow.
+    source = _Column()
+    #: Index of the event that it leads to; the option is the walk to it.
+    target = _Column()
+    #: How often trajectories went from source to target in few steps.
+    forward = _Column()
+    #: How often they went the other way.
+    backward = _Column()
+    #: Environment steps they took from source to target in the mean; backwards, where none went forward.
+    crossing_steps = _Column()
+    #: Runs that succeeded, weighted by age.
+    successes = _Column()
+    #: Environment steps of those, summed with the same weights.
+    success_steps = _Column()
+    #: Runs that failed, weighted by age.
+    failures = _Column()
+    #: Environment steps of those, summed with the same weights.
+    failure_steps = _Column()
+    #: The time, in updates of the walker, for which the weights hold.
+    updated = _Column()
+    #: Events in which failed runs landed, shape ``(n_edges, MAX_LANDINGS)``.
+    landing = _Column()
+    #: The weight of those runs, same shape; 0 where there is none.
+    landing_weight = _Column()
 
     def __init__(self) -> None:
         self.size = 0
@@ -30,66 +65,6 @@ class Edges:
         }
         self._rows: dict[tuple[int, int], int] = {}
         self.let_go: set[tuple[int, int]] = set()  # pairs that a trajectory went between, of which a row was not kept
-
-    @property
-    def source(self) -> np.ndarray:
-        """Index of the event that the option is begun in, shape ``(n_edges,)`` like all that follow."""
-        return self._arrays["source"][: self.size]
-
-    @property
-    def target(self) -> np.ndarray:
-        """Index of the event that it leads to; the option is the walk to it."""
-        return self._arrays["target"][: self.size]
-
-    @property
-    def forward(self) -> np.ndarray:
-        """How often trajectories went from source to target in few steps."""
-        return self._arrays["forward"][: self.size]
-
-    @property
-    def backward(self) -> np.ndarray:
-        """How often they went the other way."""
-        return self._arrays["backward"][: self.size]
-
-    @property
-    def crossing_steps(self) -> np.ndarray:
-        """Environment steps they took from source to target in the mean; backwards, where none went forward."""
-        return self._arrays["crossing_steps"][: self.size]
-
-    @property
-    def successes(self) -> np.ndarray:
-        """Runs that succeeded, weighted by age."""
-        return self._arrays["successes"][: self.size]
-
-    @property
-    def success_steps(self) -> np.ndarray:
-        """Environment steps of those, summed with the same weights."""
-        return self._arrays["success_steps"][: self.size]
-
-    @property
-    def failures(self) -> np.ndarray:
-        """Runs that failed, weighted by age."""
-        return self._arrays["failures"][: self.size]
-
-    @property
-    def failure_steps(self) -> np.ndarray:
-        """Environment steps of those, summed with the same weights."""
-        return self._arrays["failure_steps"][: self.size]
-
-    @property
-    def updated(self) -> np.ndarray:
-        """The time, in updates of the walker, for which the weights hold."""
-        return self._arrays["updated"][: self.size]
-
-    @property
-    def landing(self) -> np.ndarray:
-        """Events in which failed runs landed, shape ``(n_edges, MAX_LANDINGS)``."""
-        return self._arrays["landing"][: self.size]
-
-    @property
-    def landing_weight(self) -> np.ndarray:
-        """The weight of those runs, same shape; 0 where there is none."""
-        return self._arrays["landing_weight"][: self.size]
 
     def find(self, source: int, target: int) -> int | None:
         """Return the row of a pair of events; None if there is no such edge."""

@@ -235,7 +235,7 @@ def _run_pair(
     state: tuple[np.ndarray, ...] | None = None
     episode_start = np.ones(1, dtype=bool)
     steps, nearest = 0, _distance(observation)
-    stuck, success = False, has_reached(observation, info)
+    stuck, success = False, has_reached(observation, info, begins=True)
     over = success
     while not over:
         action, state = act(observation, state=state, episode_start=episode_start, deterministic=True)
@@ -271,8 +271,10 @@ def _planning_for(agent: PolicyPredictor, env: gym.Env) -> Iterator[None]:
         planner.horizon = own
 
 
-def judge(agent: PolicyPredictor, env: gym.Env) -> Callable[[Any, dict[str, Any]], bool]:
+def judge(agent: PolicyPredictor, env: gym.Env) -> Callable[..., bool]:
     """Return what tells from an observation and an info whether the goal is reached, as an environment sees it.
+
+    A third argument says that the episode has just begun.
 
     :param agent: its metric counts where the environment says nothing
     :param env: a goal environment
@@ -281,10 +283,12 @@ def judge(agent: PolicyPredictor, env: gym.Env) -> Callable[[Any, dict[str, Any]
     if metric is None:
         metric = getattr(agent, "metric", None)
 
-    def has_reached(observation: Any, info: dict[str, Any]) -> bool:
+    def has_reached(observation: Any, info: dict[str, Any], begins: bool = False) -> bool:
         for name in ("is_success", "success"):
             if name in info:
                 return bool(info[name])
+        if metric is None and begins:
+            return False  # many tell it with a step only
         if metric is None:
             raise ValueError(f"{env} does not tell when a goal is reached: it has no radius, and says nothing in its info.")
         return metric.reached(observation["achieved_goal"], observation["desired_goal"])

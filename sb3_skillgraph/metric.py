@@ -10,22 +10,8 @@ import numpy as np
 
 from sb3_skillgraph.metric_parts import Angle, Direction, Exact, Part, Rotation, Tilt, Within, norm, positive_radius
 
-__all__ = [
-    "Angle",
-    "Ball",
-    "Custom",
-    "Direction",
-    "Exact",
-    "Metric",
-    "MetricFunction",
-    "Part",
-    "Product",
-    "Rotation",
-    "Tilt",
-    "Within",
-    "as_metric",
-    "as_saved",
-]
+__all__ = ["Angle", "Ball", "Custom", "Direction", "Exact", "Metric", "MetricFunction", "Part", "Product", "Rotation"]
+__all__ += ["Tilt", "Within", "as_metric", "as_saved"]
 
 #: Radii by which goals are apart, beside all else, for every dimension that has to match and does not: no event may be so
 #: large.

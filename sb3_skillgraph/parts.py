@@ -1,7 +1,6 @@
 """The parts of an agent, and how they are put together (Figure 10)."""
 
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, ClassVar
 
 import numpy as np
 from stable_baselines3.common.noise import ActionNoise
@@ -12,10 +11,9 @@ from sb3_skillgraph.goal_env import GoalSpec, find_view
 from sb3_skillgraph.graph import SkillGraph
 from sb3_skillgraph.learning.growth import Growth, Skills
 from sb3_skillgraph.learning.missions import Agenda, Missions
-from sb3_skillgraph.learning.rollout import RANDOM_ACTION_PROB, Rollout
+from sb3_skillgraph.learning.rollout import Rollout
 from sb3_skillgraph.learning.witness import Witness
 from sb3_skillgraph.memory.store import TransitionStore
-from sb3_skillgraph.metric import Metric
 from sb3_skillgraph.options.average import AveragedPolicy
 from sb3_skillgraph.options.factory import OptionFactory
 from sb3_skillgraph.options.option import Option
@@ -32,117 +30,70 @@ from sb3_skillgraph.walk_model import WalkModel
 HINDSIGHT_STEPS = 200
 
 
-class Common(NamedTuple):
-    """What every agent has, whatever its graph is.
+class Parts:
+    """What a :class:`~sb3_skillgraph.SkillGraphAgent` is made of; each part knows those above it only.
 
-    :param rng: the generator of all that is random
-    :param view_name: name of what policies see, None for a function
-    :param view: what policies see
-    :param store: the transitions
-    :param factory: makes options
-    :param walker: the option that walks to any goal
-    :param metric: of goal space
+    :param agent: gives environment, spaces, SB3's arguments and device
+    :param spec: lengths of observation, goal and action
+    :param arguments: the agent's keyword arguments
     """
 
-    rng: np.random.Generator
-    view_name: str | None
-    view: ScaledView
-    store: TransitionStore
-    factory: OptionFactory
-    walker: Option
-    metric: Metric
+    #: Further arguments of the options' replay buffers.
+    replay_kwargs: ClassVar[dict[str, Any]] = {}
 
-    @classmethod
-    def build(
-        cls, agent: OffPolicyAlgorithm, spec: GoalSpec, arguments: dict[str, Any], replay: dict[str, Any] | None = None
-    ) -> "Common":
-        """Build what follows from the arguments directly.
-
-        :param agent: gives environment, spaces, SB3's arguments and device
-        :param spec: lengths of observation, goal and action
-        :param arguments: the agent's keyword arguments
-        :param replay: further arguments of the options' replay buffers
-        """
-        rng = np.random.default_rng(agent.seed)
-        metric = goal_metric(arguments["event_radius"], agent.env, spec.goal_dim)
-        view_name, function = find_view(arguments["option_view"], agent.env, spec, metric)
-        view = ScaledView(function, metric)
-        store = TransitionStore(agent.buffer_size, spec.observation_dim, spec.goal_dim, spec.action_dim, agent.n_envs)
-        factory = OptionFactory(
-            option_class(arguments["option_class"]),
-            option_kwargs(agent, arguments),
-            store,
-            view,
-            box(agent.action_space),
-            metric,
-            arguments["goal_tolerance"],
-            rng,
-            {"hindsight": arguments["hindsight"], "horizon": HINDSIGHT_STEPS, **(replay or {})},
-            agent.device,
-            arguments["shaping"],
-        )
-        return cls(rng, view_name, view, store, factory, factory.make("walker", None, None), metric)
-
-    def rollout(self, runner: Runner, missions: Agenda, witness: Any, arguments: dict[str, Any]) -> Rollout:
-        """Build what learns from steps.
-
-        :param runner: runs options
-        :param missions: what the agent is about
-        :param witness: learns from runs
-        :param arguments: the agent's keyword arguments
-        """
-        noise = arguments["action_noise"]
-        deviation = 0.0 if noise is None or isinstance(noise, ActionNoise) else float(noise)
-        return Rollout(runner, missions, witness, self.store, deviation, RANDOM_ACTION_PROB, self.rng)
-
-
-@dataclass
-class Parts:
-    """What a :class:`~sb3_skillgraph.SkillGraphAgent` is made of; each part knows those above it only."""
-
-    rng: np.random.Generator
-    view_name: str | None
-    factory: OptionFactory
-    store: TransitionStore
-    walker: Option
     graph: SkillGraph
     model: WalkModel
     planner: Planner
     runner: Runner
     missions: Agenda
     witness: Witness
-    rollout: Rollout
     skills: Any  # :class:`Skills`; with ``**PAPER`` the options of its chains
-    average: AveragedPolicy
 
-    @classmethod
-    def build(cls, agent: OffPolicyAlgorithm, spec: GoalSpec, arguments: dict[str, Any]) -> "Parts":
-        """Put an agent together.
+    def __init__(self, agent: OffPolicyAlgorithm, spec: GoalSpec, arguments: dict[str, Any]) -> None:
+        self.rng = np.random.default_rng(agent.seed)
+        self.metric = goal_metric(arguments["event_radius"], agent.env, spec.goal_dim)
+        self.view_name, function = find_view(arguments["option_view"], agent.env, spec, self.metric)
+        self.view = ScaledView(function, self.metric)
+        self.store = TransitionStore(agent.buffer_size, spec.observation_dim, spec.goal_dim, spec.action_dim, agent.n_envs)
+        self.factory = OptionFactory(
+            option_class(arguments["option_class"]),
+            option_kwargs(agent, arguments),
+            self.store,
+            self.view,
+            box(agent.action_space),
+            self.metric,
+            arguments["goal_tolerance"],
+            self.rng,
+            {"hindsight": arguments["hindsight"], "horizon": HINDSIGHT_STEPS, **self.replay_kwargs},
+            agent.device,
+            arguments["shaping"],
+        )
+        self.walker = self.factory.make("walker", None, None)
+        self.average = AveragedPolicy(self.walker.learner)  # what predict acts by
+        learning = self._build(agent, spec, arguments)
+        noise = arguments["action_noise"]
+        deviation = 0.0 if noise is None or isinstance(noise, ActionNoise) else float(noise)
+        self.rollout = Rollout(learning, self.missions, self.witness, self.store, deviation, self.rng)
 
-        :param agent: gives environment, spaces, SB3's arguments and device
-        :param spec: lengths of observation, goal and action
-        :param arguments: the agent's keyword arguments
-        """
-        common = Common.build(agent, spec, arguments)
-        rng, view_name, view, store, factory, walker, metric = common
-        graph = SkillGraph(spec.goal_dim, metric, arguments["max_events"], arguments["walk_steps"])
-        model = WalkModel(metric.n_matched)
-        planner = Planner(graph, model, HORIZON)
-        skills = Skills(graph, factory, walker)
-        average = AveragedPolicy(walker.learner)  # what predict acts by
-        runner = Runner(graph, planner, average.actor, view, skills, second=walker.actor)
-        missions = Missions(
-            graph,
-            find_salience(arguments, graph, store, agent),
+    def _build(self, agent: OffPolicyAlgorithm, spec: GoalSpec, arguments: dict[str, Any]) -> Runner:
+        """Build what differs with the rules, and return what runs options while learning."""
+        self.graph = SkillGraph(spec.goal_dim, self.metric, arguments["max_events"], arguments["walk_steps"])
+        self.model = WalkModel(self.metric.n_matched)
+        self.planner = Planner(self.graph, self.model, HORIZON)
+        self.skills = Skills(self.graph, self.factory, self.walker)
+        runs = self.graph, self.planner
+        self.runner = Runner(*runs, self.average.actor, self.view, self.skills, second=self.walker.actor)
+        self.missions = Missions(
+            self.graph,
+            find_salience(arguments, self.graph, self.store, agent),
             arguments["exploration_steps"],
             arguments["explore_beyond"],
-            rng,
+            self.rng,
         )
-        witness = Witness(graph, planner.choice_model, agent.n_envs, Growth(arguments["skills"], graph, skills))
+        growth = Growth(arguments["skills"], self.graph, self.skills)
+        self.witness = Witness(self.graph, self.planner.choice_model, agent.n_envs, growth)
         # Who learns acts by the policy as it is.
-        rollout = common.rollout(Runner(graph, planner, walker.actor, view, skills), missions, witness, arguments)
-        known = (rng, view_name, factory, store, walker, graph, model, planner, runner, missions, witness, rollout)
-        return cls(*known, skills, average)
+        return Runner(*runs, self.walker.actor, self.view, self.skills)
 
     def options(self) -> Any:
         """Return all options: the walks, one to each event, which share their SB3 model."""
@@ -173,13 +124,6 @@ class Parts:
         earned = [(skills[id], round(n_updates * n / rollout.n_steps)) for id, n in rollout.ran.items() if id in skills]
         rollout.ran, rollout.n_steps = {}, 0
         return earned
-
-    def learned(self, n_updates: int) -> None:
-        """Let the policy that ``predict`` acts by follow the one that learns.
-
-        :param n_updates: how many there were
-        """
-        self.average.follow(n_updates)
 
     def get_state(self) -> dict[str, Any]:
         """Return what has been learned beside the walker's networks, as plain data."""

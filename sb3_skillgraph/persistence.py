@@ -18,7 +18,6 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_skillgraph import generators
 from sb3_skillgraph.goal_env import describe_space, make_space, refuse_changed_goals
-from sb3_skillgraph.learning.scale import LOOK_AT
 from sb3_skillgraph.metric import Metric, as_saved
 from sb3_skillgraph.options.learner import OptionDDPG, OptionLearner, OptionTD3
 from sb3_skillgraph.options.parameters import parameters, set_parameters
@@ -234,8 +233,6 @@ def _restore(agent: Any, tree: dict[str, Any], same_envs: bool) -> None:
         parts.missions.salience.set_state(progress["salience"])
     parts.rng.bit_generator.state = progress["rng"]
     parts.rollout.set_state(progress["rollout"], same_envs)
-    if agent.num_timesteps >= LOOK_AT:
-        parts.rollout.scale = None  # it has told what it saw
     if same_envs:
         agent._env_snapshot = progress["environments"]
     before = generators.get_states()

@@ -281,6 +281,8 @@ def test_environment_of_another_shape(trained_files: tuple[Path, Path]) -> None:
         SkillGraphAgent.load(trained_files[0], env=Spaces())
     with pytest.raises(ValueError, match="spaces do not match"):
         new_agent().set_env(Spaces())
+    with pytest.raises(ValueError, match="set_env takes as many environments as the agent has, 1, not 2"):
+        new_agent().set_env(new_vec_env(n_envs=2))
 
 
 def test_option_env_needs_a_goal_environment() -> None:

@@ -269,6 +269,12 @@ def test_a_maze_without_room_for_pairs_is_refused(folder: Path, capsys: Capture)
     assert "too small" in error_line(capsys, ["evaluate", str(folder / "agent.zip"), "--env", TOY, *maze])
 
 
+@pytest.mark.parametrize("seed", ["-1", "one", str(2**32)])
+@pytest.mark.parametrize("command", ["evaluate", "plot"])
+def test_seeds_are_whole_numbers(folder: Path, command: str, seed: str, capsys: Capture) -> None:
+    assert "a seed is a whole number from 0 to 4294967295" in error_line(capsys, [command, str(folder), "--seed", seed])
+
+
 # -- evaluate and plot ------------------------------------------------------------------------------------------------
 
 

@@ -242,6 +242,20 @@ def test_environments_without_walls_draw_starts_and_goals_themselves(trained: Sk
         evaluate_pairs(trained, "Bare-v0", n_pairs=1, adapt_timesteps=10)
 
 
+class TellsInSteps(Bare):
+    """It says where the goal is reached, but with a step only, as many environments do."""
+
+    def step(self, action: Any) -> Any:
+        *step, info = self.inner.step(action)
+        return *step, {"is_success": info["is_success"]}
+
+
+def test_an_environment_may_tell_success_with_its_steps_only() -> None:
+    pairs = evaluate_pairs(RandomWalk(), TellsInSteps(), n_pairs=8).pairs
+    assert 0 < sum(pair.success for pair in pairs) < 8
+    assert all(pair.steps for pair in pairs)
+
+
 def test_a_task_may_know_the_radius() -> None:
     class Tasked(Bare):
         task = SimpleNamespace(distance_threshold=0.3)

@@ -349,9 +349,8 @@ class Learning:
         missions = Missions(graph, Proposes(*proposals), EXPLORATION, BEYOND, self.rng)
         witness = Witness(graph, ChoiceModel(graph, model), n_envs, Growth("never", graph, {}))  # type: ignore[arg-type]
         self.store = TransitionStore(10_000, 2, 2, 2, n_envs)
-        self.rollout = Rollout(
-            runner, missions, witness, self.store, noise_std=NOISE, random_action_prob=random_actions, rng=self.rng
-        )
+        self.rollout = Rollout(runner, missions, witness, self.store, noise_std=NOISE, rng=self.rng)
+        self.rollout.random_action_prob = random_actions
         self.graph, self.missions = graph, missions
         self.points = np.array([[0.0, 40.0 * i] for i in range(n_envs)])
         self.rollout.begin_anew(self.points)

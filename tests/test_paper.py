@@ -1,5 +1,6 @@
 """``PAPER``: the paper as written, section by section; the names of the tests tell which."""
 
+import copy
 import json
 from collections.abc import Iterator
 from pathlib import Path
@@ -472,7 +473,7 @@ def test_what_a_way_is_worth() -> None:
 def restless() -> Iterator[None]:
     """Half of the steps are random, in loaded agents as well."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("sb3_skillgraph.parts.RANDOM_ACTION_PROB", 0.5)
+        patch.setattr("sb3_skillgraph.learning.rollout.RANDOM_ACTION_PROB", 0.5)
         yield
 
 
@@ -529,8 +530,18 @@ def test_what_plan_says_predict_does(learned: SkillGraphAgent) -> None:
     assert n_planned > 0
 
 
-def test_it_is_saved_and_goes_on_exactly(tmp_path: Path) -> None:
-    whole, first = small(env=gym.make(TOY)), small(env=gym.make(TOY))
+def test_options_of_a_deep_copy_lead_to_those_of_the_copy(learned: SkillGraphAgent) -> None:
+    twin = copy.deepcopy(learned)
+    options = twin.parts.skills
+    child = next(option for option in options.values() if option.target in options)
+    options[child.target].initiation.core = np.array([9.0, 9.0])
+    assert (child.replay.aim() == 9.0).all()
+    assert (learned.parts.skills[child.id].replay.aim() < 9.0).all()
+
+
+@pytest.mark.parametrize("buffer_size", [10_000, 150])
+def test_it_is_saved_and_goes_on_exactly(tmp_path: Path, buffer_size: int) -> None:
+    whole, first = (small(env=gym.make(TOY), buffer_size=buffer_size) for _ in range(2))
     whole.learn(900, log_interval=None)
     first.learn(600, log_interval=None)
     first.save(tmp_path / "agent")

@@ -346,7 +346,7 @@ def test_without_rows_of_its_own_an_option_learns_from_the_whole_store_in_hindsi
 @profile(30)
 def test_a_view_never_reads_an_overwritten_row(turns: list[int], everything: bool) -> None:
     store = SpyStore(20, OBSERVATION_DIM, 2, 1, 1)
-    replay = make_replay(store, OptionRule(BALL, termination=None if everything else EVENT), capacity=10)
+    replay = make_replay(store, OptionRule(BALL, termination=None if everything else EVENT))
     for k, n in enumerate(turns):
         for _ in range(n):
             number = np.full((1, 1), store.total, dtype=np.float32)
@@ -362,14 +362,21 @@ def test_a_view_never_reads_an_overwritten_row(turns: list[int], everything: boo
         assert replay.size() <= len(store)
 
 
-def test_only_the_newest_own_rows_are_kept() -> None:
-    store = walked_store(n_steps=100)
-    replay = make_replay(store, OptionRule(BALL, termination=EVENT), hindsight=0.0, shared=0.0, capacity=20)
-    for row in range(0, 200, 2):
-        replay.add_rows(np.array([row]))
-    assert 10 <= replay.size() <= 20
-    rows = set(replay.sample(400).actions.numpy()[:, 0].astype(int))
-    assert rows == set(range(200 - 2 * replay.size(), 200, 2))
+def test_own_rows_are_kept_as_long_as_the_store_keeps_them() -> None:
+    store = walked_store(capacity=60, n_steps=0)
+    replay = make_replay(store, OptionRule(BALL, termination=EVENT), hindsight=0.0, shared=0.0)
+    restored = make_replay(store, OptionRule(BALL, termination=EVENT), hindsight=0.0, shared=0.0)
+    point, no = np.zeros((2, 2)), np.zeros(2, dtype=bool)
+    for t in range(1_000):
+        rows = store.add(point[:, :OBSERVATION_DIM], point, point[:, :OBSERVATION_DIM], point, point[:, :1], point, no, no)
+        replay.add_rows(rows[:1])
+        restored.add_rows(rows[:1])
+        if t == 500:  # what was overwritten before tells nothing of what is kept later
+            restored.set_state(restored.get_state())
+        assert replay.size() == restored.size() == min(t + 1, 30)
+    assert len(replay._rows) < 200
+    np.testing.assert_array_equal(replay.get_state()["rows"], np.arange(1_940, 2_000, 2))
+    np.testing.assert_array_equal(restored.get_state()["rows"], np.arange(1_940, 2_000, 2))
 
 
 def test_replay_state_round_trip() -> None:

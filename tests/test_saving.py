@@ -347,11 +347,12 @@ def test_what_is_in_a_file_is_all_there(trained_files: tuple[Path, Path]) -> Non
 
 
 class Untold(gym.Env):
-    """A point in a square; episodes have 30 steps, and nothing says so."""
+    """A point in a square; episodes have so many steps, and nothing says so."""
 
     distance_threshold = 0.3
 
-    def __init__(self) -> None:
+    def __init__(self, length: int = 30) -> None:
+        self.length = length
         box = spaces.Box(-3.0, 3.0, (2,), np.float32)
         self.observation_space = spaces.Dict({"observation": box, "achieved_goal": box, "desired_goal": box})
         self.action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
@@ -365,7 +366,7 @@ class Untold(gym.Env):
     def step(self, action: np.ndarray) -> Any:
         self.n_steps += 1
         self.point = np.clip(self.point + 0.1 * action, -3.0, 3.0).astype(np.float32)
-        return self._seen(), 0.0, False, self.n_steps >= 30, {}
+        return self._seen(), 0.0, False, self.n_steps >= self.length, {}
 
     def _seen(self) -> dict[str, np.ndarray]:
         return {"observation": self.point, "achieved_goal": self.point, "desired_goal": self.goal}
@@ -378,6 +379,10 @@ def test_how_long_episodes_are_is_learned_where_the_environment_does_not_tell(tm
     for env in (None, Untold()):
         assert SkillGraphAgent.load(tmp_path / "agent", env=env).parts.planner.horizon == 30
     assert SkillGraphAgent.load(tmp_path / "agent", env=TimeLimit(Untold(), 20)).parts.planner.horizon == 20
+    # Shorter ones, too, where another environment is given
+    assert SkillGraphAgent.load(tmp_path / "agent", env=Untold(12)).learn(40).parts.planner.horizon == 12
+    agent.set_env(Untold(10))
+    assert agent.learn(40, reset_num_timesteps=False).parts.planner.horizon == 10
 
 
 class Trail(gym.Wrapper):

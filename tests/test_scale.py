@@ -9,31 +9,28 @@ import numpy as np
 import pytest
 
 from sb3_skillgraph import SkillGraphAgent
-from sb3_skillgraph.learning.scale import LOOK_AT, Scale
+from sb3_skillgraph.learning.scale import LOOK_AT, tell_scale
+from sb3_skillgraph.memory.store import TransitionStore
 from sb3_skillgraph.metric import Ball
 
 TOY = "SkillGraph/ToyMaze-v0"
 
 
-def told(scale: Scale) -> list[str]:
+def told(store: TransitionStore) -> list[str]:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        scale.tell()
+        tell_scale(store, Ball(0.5))
     return [str(warning.message) for warning in caught]
 
 
-def walked(step: float, length: int, n_envs: int = 2) -> Scale:
-    """A scale that has seen agents go along a line and back, episodes of ``length`` steps."""
-    scale, x, t = Scale(Ball(0.5)), np.zeros((n_envs, 1)), 0
-    seen = False
-    while not seen:
-        t += 1
-        after = x + step
+def walked(step: float, length: int, n_envs: int = 2) -> TransitionStore:
+    """What agents have seen that go along a line, episodes of ``length`` steps."""
+    store, x, no = TransitionStore(2 * LOOK_AT, 1, 1, 1, n_envs), np.zeros((n_envs, 1)), np.zeros(n_envs, dtype=bool)
+    for t in range(1, LOOK_AT // n_envs + 1):
         done = t % length == 0
-        seen = scale.observe(x, after, np.full(n_envs, done))
-        x = np.zeros_like(x) if done else after
-    assert t == -(-LOOK_AT // n_envs)
-    return scale
+        store.add(x, x, x + step, x + step, np.zeros_like(x), x, no, np.full(n_envs, done))
+        x = np.zeros_like(x) if done else x + step
+    return store
 
 
 @pytest.mark.parametrize(
@@ -44,6 +41,7 @@ def walked(step: float, length: int, n_envs: int = 2) -> Scale:
         (1.5, 50, ["3.0 event radii long"]),
         (0.1, 4, ["0.8 event radii from its begin"]),
         (0.1, 10_000, []),
+        (0.01, 1_000, []),
     ],
 )
 def test_what_is_told(step: float, length: int, messages: list[str]) -> None:
@@ -89,4 +87,9 @@ def test_it_is_told_after_loading_too(tmp_path: Path) -> None:
     with pytest.warns(UserWarning, match="hardly moves"):
         loaded.learn(LOOK_AT + 50, reset_num_timesteps=False)
     loaded.save(tmp_path / "agent")
-    assert SkillGraphAgent.load(tmp_path / "agent", env=Pinned(gym.make(TOY))).parts.rollout.scale is None
+    loaded.save_replay_buffer(tmp_path / "experience")
+    again = SkillGraphAgent.load(tmp_path / "agent", env=Pinned(gym.make(TOY)))
+    again.load_replay_buffer(tmp_path / "experience")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        again.learn(100, reset_num_timesteps=False)

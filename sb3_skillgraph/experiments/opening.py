@@ -30,12 +30,23 @@ def add_command(commands: Any, name: str, run: Any, summary: str, detail: str) -
     return command
 
 
+def seed(text: str) -> int:
+    """Read a seed.
+
+    :param text: as it was typed
+    :raises argparse.ArgumentTypeError: if it is none
+    """
+    if not text.isdecimal() or int(text) >= 2**32:
+        raise argparse.ArgumentTypeError(f"a seed is a whole number from 0 to {2**32 - 1}, not {text!r}")
+    return int(text)
+
+
 def add_seed(command: argparse.ArgumentParser) -> None:
     """Add the seed of a command that draws something.
 
     :param command: its parser
     """
-    command.add_argument("--seed", type=int, default=0, help="seed of everything random (default: 0)")
+    command.add_argument("--seed", type=seed, default=0, help="seed of everything random (default: 0)")
 
 
 def add_env_kwargs(command: argparse.ArgumentParser) -> None:

@@ -7,7 +7,7 @@ from stable_baselines3.common.noise import ActionNoise
 
 from sb3_skillgraph.choices import OPTIMISTIC
 from sb3_skillgraph.learning.missions import Agenda, Mission
-from sb3_skillgraph.learning.scale import Scale
+from sb3_skillgraph.learning.scale import LOOK_AT, tell_scale
 from sb3_skillgraph.learning.witness import Witness
 from sb3_skillgraph.memory.store import TransitionStore
 from sb3_skillgraph.planning import DIRECT, GOAL
@@ -40,7 +40,6 @@ class Rollout:
     :param witness: learns from trajectories and runs
     :param store: receives every transition, once
     :param noise_std: standard deviation of the Gaussian noise on scaled actions, where no other noise is given
-    :param random_action_prob: share of the steps, beside explorations, that are random
     :param rng: random generator
     """
 
@@ -51,7 +50,6 @@ class Rollout:
         witness: Witness,
         store: TransitionStore,
         noise_std: float,
-        random_action_prob: float,
         rng: np.random.Generator,
     ) -> None:
         self.runner = runner
@@ -59,13 +57,11 @@ class Rollout:
         self.witness = witness
         self.store = store
         self.noise_std = noise_std
-        self.random_action_prob = random_action_prob
+        self.random_action_prob = RANDOM_ACTION_PROB
         self.rng = rng
         self.pending: Step | None = None
         self.n_stuck = 0  # episodes given up
-        self.longest = 0  # steps of the longest episode that was cut
         self.is_told_limit = False  # whether the environment says how long episodes are
-        self.scale: Scale | None = Scale(runner.graph.metric)  # until it has told
         self.ran: dict[str, int] = {}  # environment steps of each skill since there was training
         self.n_steps = 0  # and of all together
         self._forget()
@@ -85,6 +81,7 @@ class Rollout:
         self.state = RunnerState.fresh(n_envs, graph.goal_dim, self.store.observation_dim)
         self.held = np.zeros((n_envs, self.store.action_dim), dtype=np.float32)
         self.hold_left = np.zeros(n_envs, dtype=np.int64)
+        self.longest = 0  # steps of the longest episode that was cut since
         self.pending = None
         self.store.cut()
         self.witness.cut(n_envs)
@@ -195,9 +192,8 @@ class Rollout:
                 skills[option].replay.add_rows(rows[i : i + 1])
                 self.ran[option] = self.ran.get(option, 0) + 1
         self.n_steps += len(points)
-        if self.scale is not None and self.scale.observe(step.observation["achieved_goal"], points, dones):
-            self.scale.tell()
-            self.scale = None
+        if self.store.total - len(points) < LOOK_AT <= self.store.total:
+            tell_scale(self.store, self.runner.graph.metric)
         cut = dones & ~terminated & ~stuck
         if cut.any():
             self.longest = max(self.longest, int(step.state.elapsed[cut].max()))
@@ -248,11 +244,11 @@ class Rollout:
         :param same_envs: whether the environments go on where they were; else they begin anew
         """
         self.n_stuck, self.ran, self.n_steps = state["n_stuck"], dict(state["ran"]), state["n_steps"]
-        self.longest = state["longest"]
         self.witness.set_state(state["witness"])
         self.missions.set_state(state["missions"])
         if not same_envs:
             self._forget()
             return
+        self.longest = state["longest"]
         self.state = RunnerState(*state["runner"])
         self.held, self.hold_left = state["held"], state["hold_left"]

@@ -101,7 +101,6 @@ class OptionReplay(ReplayBuffer):
     :param horizon: steps ahead from which an achieved goal is drawn
     :param aim: returns the point that its policy is to aim at, shape ``(goal_dim,)``; None for the goal that was pursued
     :param doomed_steps: steps before the agent got stuck in which no goal is put in
-    :param capacity: number of own row numbers kept
     :param device: torch device of the samples
     """
 
@@ -119,7 +118,6 @@ class OptionReplay(ReplayBuffer):
         horizon: int = 200,
         aim: Callable[[], np.ndarray] | None = None,
         doomed_steps: int = 50,
-        capacity: int = 100_000,
         device: th.device | str = "auto",
     ) -> None:
         # SB3's constructor allocates buffer_size rows of its own; the shared store holds ours.
@@ -133,7 +131,6 @@ class OptionReplay(ReplayBuffer):
         self.horizon = horizon
         self.aim = aim
         self.doomed_steps = doomed_steps
-        self.buffer_size = capacity
         self._rows = np.zeros(256, dtype=np.int64)
         self._n_rows = 0
 
@@ -151,16 +148,14 @@ class OptionReplay(ReplayBuffer):
 
         :param rows: row numbers of the store, ascending
         """
-        needed = self._n_rows + len(rows)
-        if needed > self.buffer_size:
-            kept = self._rows[: self._n_rows][-(self.buffer_size // 2) :]
-            self._rows[: len(kept)] = kept
-            self._n_rows = len(kept)
-            needed = self._n_rows + len(rows)
-        while needed > len(self._rows):
-            self._rows = np.concatenate([self._rows, np.zeros_like(self._rows)])
-        self._rows[self._n_rows : needed] = rows
-        self._n_rows = needed
+        n_rows = self._n_rows + len(rows)
+        if n_rows > len(self._rows):
+            # Full: rows that the store has overwritten make room, and as much again as is kept
+            kept = self._readable()
+            n_rows = len(kept) + len(rows)
+            self._rows = np.concatenate([kept, np.zeros(n_rows + len(rows), dtype=np.int64)])
+        self._rows[n_rows - len(rows) : n_rows] = rows
+        self._n_rows = n_rows
 
     def _readable(self) -> np.ndarray:
         rows = self._rows[: self._n_rows]

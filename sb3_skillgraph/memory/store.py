@@ -122,13 +122,21 @@ class TransitionStore:
         """Tell after which rows the agent was stuck, shape ``(len(rows),)``."""
         return self._stuck[rows % self.capacity]
 
+    def trajectory(self, rows: np.ndarray) -> np.ndarray:
+        """Return the numbers of the trajectories that rows are of, shape ``(len(rows),)``."""
+        return self._trajectory[rows % self.capacity]
+
+    def is_running(self, trajectories: np.ndarray) -> np.ndarray:
+        """Tell which trajectories are not over, bool array of the same shape."""
+        return np.isin(trajectories, self._current)
+
     def doomed(self, rows: np.ndarray, within: int) -> np.ndarray:
         """Tell which rows lie at most so many steps before the agent got stuck, shape ``(len(rows),)``.
 
         :param rows: row numbers
         :param within: number of steps
         """
-        last = self._last_row[self._trajectory[rows % self.capacity]]
+        last = self._last_row[self.trajectory(rows)]
         return self.stuck(last) & ((last - rows) // self.n_envs < within)
 
     def cut(self) -> None:

@@ -1,6 +1,7 @@
 """Building options: a headless SB3 model each, with a view of the shared store as its replay buffer."""
 
 import copy
+from functools import partial
 from inspect import signature
 from typing import Any
 
@@ -85,13 +86,12 @@ class OptionFactory:
             self.observation_space,
             self.action_space,
             self.rng,
-            capacity=self.store.capacity,
             device=self.device,
             **self.replay_kwargs,
         )
         option = Option(id, target, termination, self._learner(replay), self.metric)
         if termination is not None:
-            replay.aim = lambda: option.subgoal
+            replay.aim = partial(getattr, option, "subgoal")  # and not a lambda: of a deep copy it is the copy's
         return option
 
     def _learner(self, replay: OptionReplay) -> OffPolicyAlgorithm:

@@ -1,7 +1,6 @@
 """The parts of an agent that does as the paper does, and how they are put together (Figure 10)."""
 
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
@@ -10,7 +9,6 @@ from sb3_skillgraph.arguments import HORIZON, find_salience
 from sb3_skillgraph.edges import NOWHERE
 from sb3_skillgraph.goal_env import GoalSpec
 from sb3_skillgraph.metric import Ball
-from sb3_skillgraph.options.average import AveragedPolicy
 from sb3_skillgraph.options.option import Option
 from sb3_skillgraph.options.parameters import set_skill_state, skill_state
 from sb3_skillgraph.paper.chaining import DeepSkillChaining
@@ -18,7 +16,7 @@ from sb3_skillgraph.paper.graph import PaperGraph
 from sb3_skillgraph.paper.missions import PaperMissions
 from sb3_skillgraph.paper.policy import PaperPolicy
 from sb3_skillgraph.paper.witness import PaperWitness
-from sb3_skillgraph.parts import Common, Parts
+from sb3_skillgraph.parts import Parts
 from sb3_skillgraph.plan import Plan
 from sb3_skillgraph.planning import Planner
 from sb3_skillgraph.runner import Runner
@@ -26,44 +24,30 @@ from sb3_skillgraph.running import RunnerState
 from sb3_skillgraph.walk_model import WalkModel
 
 
-@dataclass
 class PaperParts(Parts):
     """What a :class:`~sb3_skillgraph.SkillGraphAgent` is made of with ``**PAPER``.
 
     The walker is there, since every SB3 algorithm has a policy, but it does not learn, and acts only where there is no option.
+    Options act by their policies as they are.
     """
 
-    chaining: DeepSkillChaining
-    policy: PaperPolicy
+    replay_kwargs: ClassVar[dict[str, Any]] = {"shared": 0.0}  # options learn from their own experience
 
-    @classmethod
-    def build(cls, agent: OffPolicyAlgorithm, spec: GoalSpec, arguments: dict[str, Any]) -> "PaperParts":
-        """Put an agent together.
-
-        :param agent: gives environment, spaces, SB3's arguments and device
-        :param spec: lengths of observation, goal and action
-        :param arguments: the agent's keyword arguments
-        """
-        common = Common.build(agent, spec, arguments, {"shared": 0.0})  # options learn from their own experience
-        rng, view_name, view, store, factory, walker, metric = common
+    def _build(self, agent: OffPolicyAlgorithm, spec: GoalSpec, arguments: dict[str, Any]) -> Runner:
+        rules, metric = arguments["rules"], self.metric
         if not isinstance(metric, Ball):
-            raise ValueError(f"With rules={arguments['rules']!r} events are balls: event_radius must be a number.")
-        rules = arguments["rules"]
+            raise ValueError(f"With rules={rules!r} events are balls: event_radius must be a number.")
         graph = PaperGraph(spec.goal_dim, metric, arguments["walk_steps"])
-        chaining = DeepSkillChaining(graph, factory.make, rules.gestation_period)
-        model = WalkModel()
-        planner = Planner(graph, model, HORIZON)  # never asked: the rules choose
-        policy = PaperPolicy(graph, chaining, rules.timeout, planner)
-        runner = Runner(graph, planner, walker.actor, view, chaining.options, policy)
-        salience = find_salience(arguments, graph, store, agent, relearn=1)
-        missions = PaperMissions(graph, chaining, salience, rules, arguments["exploration_steps"], rng)
-        witness: Any = PaperWitness(graph, chaining, missions, agent.n_envs)
-        rollout = common.rollout(runner, missions, witness, arguments)
-        known = (rng, view_name, factory, store, walker, graph, model, planner, runner, missions, witness, rollout)
-        return cls(*known, chaining.options, AveragedPolicy(walker.learner), chaining, policy)
-
-    def learned(self, n_updates: int) -> None:
-        """Options act by their policies as they are."""
+        self.chaining = DeepSkillChaining(graph, self.factory.make, rules.gestation_period)
+        self.graph, self.model, self.skills = graph, WalkModel(), self.chaining.options
+        self.planner = Planner(graph, self.model, HORIZON)  # never asked: the rules choose
+        self.policy = PaperPolicy(graph, self.chaining, rules.timeout, self.planner)
+        self.runner = Runner(graph, self.planner, self.walker.actor, self.view, self.skills, self.policy)
+        salience = find_salience(arguments, graph, self.store, agent, relearn=1)
+        missions = PaperMissions(graph, self.chaining, salience, rules, arguments["exploration_steps"], self.rng)
+        witness: Any = PaperWitness(graph, self.chaining, missions, agent.n_envs)
+        self.missions, self.witness = missions, witness
+        return self.runner
 
     def options(self) -> list[Any]:
         """Return all options, gestating ones too, in the order of their making."""
