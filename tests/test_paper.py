@@ -539,7 +539,7 @@ def test_options_of_a_deep_copy_lead_to_those_of_the_copy(learned: SkillGraphAge
     assert (learned.parts.skills[child.id].replay.aim() < 9.0).all()
 
 
-@pytest.mark.parametrize("buffer_size", [10_000, 150])
+@pytest.mark.parametrize("buffer_size", [10_000, 100])
 def test_it_is_saved_and_goes_on_exactly(tmp_path: Path, buffer_size: int) -> None:
     whole, first = (small(env=gym.make(TOY), buffer_size=buffer_size) for _ in range(2))
     whole.learn(900, log_interval=None)
