@@ -11,7 +11,8 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import TrainFreq
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_skillgraph.goal_env import Oracle, env_attribute, env_metric
+from sb3_skillgraph.envs.metrics import env_metric
+from sb3_skillgraph.goal_env import Oracle, env_attribute
 from sb3_skillgraph.graph import SkillGraph
 from sb3_skillgraph.learning.dco import LEARN_EVERY, DCOSalience
 from sb3_skillgraph.learning.salience import FrontierSalience, RandomSalience, Salience

@@ -16,8 +16,8 @@ from sb3_skillgraph.agent import SkillGraphAgent
 from sb3_skillgraph.calibration import CalibrationBin, calibration
 from sb3_skillgraph.calibration import brier_score as brier_score
 from sb3_skillgraph.envs import MazeGeometry, find
+from sb3_skillgraph.envs.metrics import metric_of
 from sb3_skillgraph.envs.wrappers import time_limit
-from sb3_skillgraph.goal_env import metric_of
 from sb3_skillgraph.hyperparams import make_recommended
 from sb3_skillgraph.planning import DIRECT
 

@@ -1,6 +1,7 @@
 """Running options, one environment step at a time: the same in ``learn`` and in ``predict`` (sections 3.2.4, A.6)."""
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -42,6 +43,7 @@ class Rules(Protocol):
 Chooser = Callable[[RunnerState, int, np.ndarray, np.ndarray, float], Chosen]
 
 
+@dataclass(eq=False, repr=False)
 class Runner:
     """Lets the first option of the plan run, and plans anew when it has ended.
 
@@ -56,23 +58,13 @@ class Runner:
     :param second: the walker's policy in the run after a failed one; None for the same
     """
 
-    def __init__(
-        self,
-        graph: SkillGraph,
-        planner: Planner,
-        actor: NumpyActor,
-        view: View,
-        skills: Mapping[str, Option] | None = None,
-        rules: Rules | None = None,
-        second: NumpyActor | None = None,
-    ) -> None:
-        self.graph = graph
-        self.planner = planner
-        self.actor = actor
-        self.view = view
-        self.skills = {} if skills is None else skills
-        self.rules = rules
-        self.second = second
+    graph: SkillGraph
+    planner: Planner
+    actor: NumpyActor
+    view: View
+    skills: Mapping[str, Option] = field(default_factory=dict)
+    rules: Rules | None = None
+    second: NumpyActor | None = None
 
     # -- one step -----------------------------------------------------------------------------------------------------
 

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sb3_skillgraph import SkillGraphAgent
-from sb3_skillgraph.goal_env import env_metric
+from sb3_skillgraph.envs.metrics import env_metric
 from sb3_skillgraph.metric import (
     MISMATCH,
     Angle,

@@ -86,7 +86,8 @@ def state() -> RunnerState:
 
 def run_along(chaining: DeepSkillChaining, option: Option, xs: list[float], end: float) -> None:
     """Let an option succeed: on its way along the x-axis it passed some places."""
-    chaining.succeeded(option, np.array([[x, 0.0] for x in xs]), np.array([end, 0.0]), len(xs))
+    option.succeeded(np.array([[x, 0.0] for x in xs]), np.array([end, 0.0]), len(xs))
+    chaining.learned(option)
 
 
 # -- Table 1 ----------------------------------------------------------------------------------------------------------
@@ -319,7 +320,8 @@ def test_3_2_5_chains_grow_backwards_until_an_option_starts_at_the_source() -> N
     assert graph.joined() == {"e0", "e1"}
     graph.triggered("e0", np.array([0.0, 0.49]))
     for _ in range(9):
-        chaining.failed(child, np.array([0.2, 0.0]), 200)
+        child.failed(np.array([0.2, 0.0]), 200)
+        chaining.learned(child)
     assert chain.complete
     assert len(chain.options) == 2
 
@@ -347,12 +349,14 @@ def test_failures_shrink_where_an_option_starts() -> None:
         run_along(chaining, root, [1.0, 2.0, 3.0, 4.0, 5.0], 6.0)
     assert root.initiation.optimistic(np.array([[1.0, 0.0]]))[0]
     for _ in range(8):
-        chaining.failed(root, np.array([1.0, 0.0]), 200)
+        root.failed(np.array([1.0, 0.0]), 200)
+        chaining.learned(root)
     assert not root.initiation.optimistic(np.array([[1.0, 0.0]]))[0]
     assert root.success_rate == pytest.approx(3 / 11)
     assert repr(root) == "<option o0 to e1: 3 of 11 runs succeeded>"
     before = len(root.initiation.failures)
-    chaining.failed(root, None, 5)  # stuck: where it began is not to blame
+    root.failed(None, 5)  # stuck: where it began is not to blame
+    chaining.learned(root)
     assert len(root.initiation.failures) == before
     assert root.n_runs == 12
 

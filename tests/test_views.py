@@ -1,8 +1,9 @@
 import numpy as np
 import pytest
 
+from sb3_skillgraph.envs.bodies import body_view, placed_body_view
 from sb3_skillgraph.metric import Ball
-from sb3_skillgraph.options.views import VIEWS, ScaledView, View, body_view, egocentric_view, placed_body_view, relative_view
+from sb3_skillgraph.options.views import VIEWS, ScaledView, View, egocentric_view, relative_view
 
 
 def rows(n: int, dim: int, seed: int) -> np.ndarray:

@@ -13,8 +13,8 @@ from gymnasium.wrappers import TimeLimit, TransformAction
 import sb3_skillgraph.envs.mujoco_mazes  # noqa: F401 (imports gymnasium-robotics, which registers its ants)
 from sb3_skillgraph import SkillGraphAgent, evaluate_pairs
 from sb3_skillgraph.envs import AntRecipe, FlattenGoals, HoldAction, Parking, PursueGoals, TellStuck, on_its_back
+from sb3_skillgraph.envs.metrics import metric_of
 from sb3_skillgraph.envs.wrappers import time_limit
-from sb3_skillgraph.goal_env import metric_of
 from sb3_skillgraph.hyperparams import load_hyperparams, make_recommended, recommended_wrapper
 from sb3_skillgraph.metric import Ball
 

@@ -7,7 +7,7 @@ import numpy as np
 from stable_baselines3 import DDPG, HerReplayBuffer
 from stable_baselines3.common.noise import NormalActionNoise
 
-from sb3_skillgraph.goal_env import metric_of
+from sb3_skillgraph.envs.metrics import metric_of
 from sb3_skillgraph.memory.replay import OptionRule
 
 #: What the agent's own options learn with, for the sake of comparison; the discount is the paper's.

@@ -1,5 +1,6 @@
 """One step of learning: act, with noise, towards what the missions want; learn from where that led (Figure 10)."""
 
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -32,6 +33,7 @@ class Step(NamedTuple):
     rng_state: Any
 
 
+@dataclass(eq=False, repr=False)
 class Rollout:
     """What the agent is in the middle of in each environment, while it learns.
 
@@ -41,24 +43,18 @@ class Rollout:
     :param store: receives every transition, once
     :param noise_std: standard deviation of the Gaussian noise on scaled actions, where no other noise is given
     :param rng: random generator
+    :param random_action_prob: share of the steps, beside explorations, that are random
     """
 
-    def __init__(
-        self,
-        runner: Runner,
-        missions: Agenda,
-        witness: Witness,
-        store: TransitionStore,
-        noise_std: float,
-        rng: np.random.Generator,
-    ) -> None:
-        self.runner = runner
-        self.missions = missions
-        self.witness = witness
-        self.store = store
-        self.noise_std = noise_std
-        self.random_action_prob = RANDOM_ACTION_PROB
-        self.rng = rng
+    runner: Runner
+    missions: Agenda
+    witness: Witness
+    store: TransitionStore
+    noise_std: float
+    rng: np.random.Generator
+    random_action_prob: float = RANDOM_ACTION_PROB
+
+    def __post_init__(self) -> None:
         self.pending: Step | None = None
         self.n_stuck = 0  # episodes given up
         self.is_told_limit = False  # whether the environment says how long episodes are

@@ -7,12 +7,12 @@ import numpy as np
 from gymnasium import spaces
 
 from sb3_skillgraph.events import Event
-from sb3_skillgraph.memory.replay import OptionRule
-from sb3_skillgraph.options.execution import Fate, fate
-from sb3_skillgraph.options.initiation import InitiationSet
 from sb3_skillgraph.options.option import Option
 from sb3_skillgraph.options.views import ScaledView, View, as_view
 from sb3_skillgraph.options.walk import Walk
+
+#: Pay for getting stuck: a hundred steps', or that of standing there for ever at a discount of 0.99.
+STUCK_REWARD = -100.0
 
 
 class OptionEnv(gym.Wrapper):
@@ -26,7 +26,6 @@ class OptionEnv(gym.Wrapper):
 
     :param env: a goal environment (Dict observations, Box actions)
     :param termination: the event the option leads to, a walk to it, or the option into whose initiation set it leads
-    :param initiation: where the option can start; ``info["can_start"]`` tells after each reset whether it can
     :param timeout: environment steps per run
     :param goal: the point the policy aims at, shape ``(goal_dim,)``; by default that of the termination set
     :param option_view: what the policy sees, as :class:`~sb3_skillgraph.SkillGraphAgent` takes it; by default what the
@@ -44,7 +43,6 @@ class OptionEnv(gym.Wrapper):
         env: gym.Env,
         termination: Event | Option | Walk,
         *,
-        initiation: InitiationSet | None = None,
         timeout: int = 200,
         goal: np.ndarray | None = None,
         option_view: str | View | None = None,
@@ -59,7 +57,6 @@ class OptionEnv(gym.Wrapper):
         if isinstance(termination, Walk):
             termination = termination.termination
         self.termination = termination
-        self.initiation = initiation
         self.timeout = timeout
         if goal is None:
             goal = termination.initiation.core if isinstance(termination, Option) else termination.center
@@ -69,7 +66,6 @@ class OptionEnv(gym.Wrapper):
         if option_view is None and env.has_wrapper_attr("option_view"):
             option_view = env.get_wrapper_attr("option_view")
         self.view = ScaledView(as_view(option_view), termination.metric)
-        self.rule = OptionRule(termination.metric, termination=termination)
         dims = [int(np.prod(space[key].shape)) for key in ("observation", "achieved_goal")]  # type: ignore[arg-type]
         self.observation_space = spaces.Box(-np.inf, np.inf, (self.view.dim(*dims),), np.float32)
         self._last: dict[str, np.ndarray] | None = None
@@ -80,14 +76,12 @@ class OptionEnv(gym.Wrapper):
 
         :param seed: seeds the wrapped environment, which is then reset
         :param options: passed to the wrapped environment, which is then reset
-        :return: what the policy sees, and ``info`` with ``can_start``
+        :return: what the policy sees, and info
         """
         info: dict[str, Any] = {}
         if self._last is None or seed is not None or options is not None:
             self._last, info = self.env.reset(seed=seed, options=options)
         self._steps = 0
-        point = np.asarray(self._last["achieved_goal"])[None]
-        info["can_start"] = self.initiation is None or bool(self.initiation.optimistic(point)[0])
         return self._see(self._last), info
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
@@ -99,16 +93,13 @@ class OptionEnv(gym.Wrapper):
         assert self._last is not None, "Call reset before step."
         observation, _, terminated, truncated, info = self.env.step(action)
         self._steps += 1
-        before, after = (np.asarray(obs["achieved_goal"]) for obs in (self._last, observation))
-        ended = fate(self.termination.holds(after), self._steps, self.timeout, bool(info.get("stuck")))
-        success, stuck = ended == Fate.SUCCEEDED, ended == Fate.STUCK
-        over = success or stuck or terminated
-        reached, ended_here, lost = np.array([success, over, stuck])[:, None]
-        reward = float(self.rule.reward(reached, ended_here, lost, before[None], after[None], self.goal[None])[0])
+        stuck = bool(info.get("stuck"))
+        success = not stuck and self.termination.holds(np.asarray(observation["achieved_goal"]))
+        reward = STUCK_REWARD if stuck else -1.0 + success
         self._last = None if stuck or terminated or truncated else observation
-        info["is_success"] = success
-        cut = not success and (ended == Fate.TIMED_OUT or truncated)
-        return self._see(observation), reward, over, cut, info
+        over = success or stuck or terminated
+        cut = not (success or stuck) and (self._steps >= self.timeout or truncated)
+        return self._see(observation), reward, over, cut, {**info, "is_success": success}
 
     def _see(self, observation: dict[str, np.ndarray]) -> np.ndarray:
         rows = [np.asarray(observation[key], dtype=np.float32).reshape(1, -1) for key in ("observation", "achieved_goal")]

@@ -1,6 +1,7 @@
 """Building options: a headless SB3 model each, with a view of the shared store as its replay buffer."""
 
 import copy
+from dataclasses import dataclass
 from functools import partial
 from inspect import signature
 from typing import Any
@@ -20,6 +21,7 @@ from sb3_skillgraph.options.parameters import parameters, set_parameters
 from sb3_skillgraph.options.views import ScaledView
 
 
+@dataclass(eq=False, repr=False)
 class OptionFactory:
     """Makes options that share a store, a view and their hyper-parameters.
 
@@ -36,34 +38,23 @@ class OptionFactory:
     :param shaping: reward for every event radius of distance gained
     """
 
-    def __init__(
-        self,
-        option_class: type[OffPolicyAlgorithm],
-        option_kwargs: dict[str, Any],
-        store: TransitionStore,
-        view: ScaledView,
-        action_space: spaces.Box,
-        metric: Metric,
-        tolerance: float,
-        rng: np.random.Generator,
-        replay_kwargs: dict[str, Any],
-        device: th.device,
-        shaping: float = 0.0,
-    ) -> None:
-        self.option_class = option_class
-        self.option_kwargs = option_kwargs
-        self.store = store
-        self.view = view
-        self.action_space = action_space
-        self.metric = metric
-        self.tolerance = tolerance
-        self.rng = rng
-        self.replay_kwargs = replay_kwargs
-        self.device = device
-        self.shaping = shaping
-        self._low = action_space.low.ravel()
-        self._half = 0.5 * (action_space.high.ravel() - self._low)
-        dim = view.dim(store.column("observation", np.arange(0)).shape[1], store.column("goal", np.arange(0)).shape[1])
+    option_class: type[OffPolicyAlgorithm]
+    option_kwargs: dict[str, Any]
+    store: TransitionStore
+    view: ScaledView
+    action_space: spaces.Box
+    metric: Metric
+    tolerance: float
+    rng: np.random.Generator
+    replay_kwargs: dict[str, Any]
+    device: th.device
+    shaping: float = 0.0
+
+    def __post_init__(self) -> None:
+        self._low = self.action_space.low.ravel()
+        self._half = 0.5 * (self.action_space.high.ravel() - self._low)
+        dims = (self.store.column(name, np.arange(0)).shape[1] for name in ("observation", "goal"))
+        dim = self.view.dim(*dims)
         self.observation_space = spaces.Box(-np.inf, np.inf, (dim,), np.float32)
 
     def unscale(self, scaled: np.ndarray) -> np.ndarray:

@@ -23,18 +23,13 @@ class Boundary(NamedTuple):
     intercept: float
     gamma: float
 
-    def inside(self, points: np.ndarray) -> np.ndarray:
-        """Tell which points lie on the positive side.
+    def depth(self, points: np.ndarray) -> np.ndarray:
+        """Return how far points lie on the positive side, as the machine measures it.
 
         :param points: shape ``(n, goal_dim)``
-        :return: bool array of shape ``(n,)``
+        :return: shape ``(n,)``, positive inside
         """
-        squared = (
-            np.einsum("ij,ij->i", points, points)[:, None]
-            - 2.0 * points @ self.support.T
-            + np.einsum("ij,ij->i", self.support, self.support)
-        )
-        return np.exp(-self.gamma * squared) @ self.weights + self.intercept > 0.0
+        return np.exp(-self.gamma * _squared_distances(points, self.support)) @ self.weights + self.intercept
 
 
 class InitiationSet:
@@ -105,14 +100,15 @@ class InitiationSet:
             points = np.concatenate([positives, negatives])
             machine = SVC(kernel="rbf", gamma=gamma, class_weight="balanced").fit(points, classes)
             split = Boundary(machine.support_vectors_, machine.dual_coef_[0], float(machine.intercept_[0]), gamma)
-            inside = split.inside(positives)
+            inside = split.depth(positives) > 0.0
             # A split that leaves no success on its side says nothing of where: that the option fails is for its rate.
             if inside.any():
                 self.optimistic_boundaries.append(split)
                 accepted = positives[inside]
         # What another option aims at must be somewhere this one can start: the core lies inside the optimistic set.
         self.pessimistic_boundaries = [_one_class(accepted, 0.1, gamma), *self.optimistic_boundaries]
-        self.core = self._deepest(accepted)
+        # The surest thing to aim at: the example furthest inside
+        self.core = accepted[self.pessimistic_boundaries[0].depth(accepted).argmax()]
 
     def _standing_failures(self) -> np.ndarray:
         """Return the failed starts that later successes have not outvoted, shape ``(n, goal_dim)``."""
@@ -123,12 +119,6 @@ class InitiationSet:
         against = (_squared_distances(failures, failures) <= near).sum(axis=1)
         passed = [(_squared_distances(failures, path) <= near).any(axis=1) for path in self.successes]
         return failures[against > np.sum(passed, axis=0)]
-
-    def _deepest(self, points: np.ndarray) -> np.ndarray:
-        """Return the example furthest inside the pessimistic set: the surest thing to aim at."""
-        boundary = self.pessimistic_boundaries[0]
-        squared = _squared_distances(points, boundary.support)
-        return points[int((np.exp(-boundary.gamma * squared) @ boundary.weights).argmax())]
 
     def optimistic(self, points: np.ndarray) -> np.ndarray:
         """Tell from which points the option may be started.
@@ -179,7 +169,7 @@ def _inside_all(boundaries: list[Boundary], points: np.ndarray) -> np.ndarray:
     points = np.asarray(points, dtype=np.float64)
     inside = np.full(len(points), bool(boundaries))
     for boundary in boundaries:
-        inside &= boundary.inside(points)
+        inside &= boundary.depth(points) > 0.0
     return inside
 
 

@@ -1,6 +1,7 @@
 """An option: initiation set, policy, termination set, effect set and the record of its runs (section 2.1)."""
 
 from collections import deque
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from sb3_skillgraph.options.numpy_actor import NumpyActor
 EFFECTS_LENGTH = 200
 
 
+@dataclass(eq=False, repr=False)
 class Option:
     """A skill: where it may start, how it acts, where it ends.
 
@@ -33,20 +35,14 @@ class Option:
     :param metric: of goal space
     """
 
-    def __init__(
-        self,
-        id: str,
-        target: str | None,
-        termination: TerminationSet | None,
-        learner: OffPolicyAlgorithm,
-        metric: Metric,
-    ) -> None:
-        self.id = id
-        self.target = target
-        self.termination = termination
-        self.learner = learner
-        self.metric = metric
-        self.initiation = InitiationSet(metric.radius)
+    id: str
+    target: str | None
+    termination: TerminationSet | None
+    learner: OffPolicyAlgorithm
+    metric: Metric
+
+    def __post_init__(self) -> None:
+        self.initiation = InitiationSet(self.metric.radius)
         self.mature = False
         self.n_successes = 0
         self.n_runs = 0

@@ -85,29 +85,8 @@ class DeepSkillChaining:
 
     # -- what runs teach ----------------------------------------------------------------------------------------------
 
-    def succeeded(self, option: Option, path: np.ndarray, end: np.ndarray, steps: int) -> None:
-        """Let an option learn from a run that reached its termination set.
-
-        :param option: the option
-        :param path: the states of the run before its end, its start first, shape ``(n, goal_dim)``
-        :param end: the state it ended in, shape ``(goal_dim,)``
-        :param steps: environment steps it took
-        """
-        option.succeeded(path, end, steps)
-        self._learned(option)
-
-    def failed(self, option: Option, start: np.ndarray | None, steps: int) -> None:
-        """Let an option learn from a run that failed.
-
-        :param option: the option
-        :param start: the state it began in, shape ``(goal_dim,)``; None if that was not to blame: the agent got stuck
-        :param steps: environment steps it took
-        """
-        option.failed(start, steps)
-        self._learned(option)
-
-    def _learned(self, option: Option) -> None:
-        """Fit where the option can start, let it mature, and see what the chains still need."""
+    def learned(self, option: Option) -> None:
+        """Fit where an option can start that has run, let it mature, and see what the chains still need."""
         refitted = option.initiation.refit(force=not option.mature)
         if not option.mature:
             if option.n_successes < self.gestation_period:

@@ -74,9 +74,10 @@ class PaperWitness:
         for event in self.graph.events_at(end) if not run.stuck else ():
             self.graph.triggered(event.id, end)
         if run.success:
-            self.chaining.succeeded(option, np.stack(path), end, run.steps)
+            option.succeeded(np.stack(path), end, run.steps)
         else:
-            self.chaining.failed(option, None if run.stuck else path[0], run.steps)
+            option.failed(None if run.stuck else path[0], run.steps)
+        self.chaining.learned(option)
 
     # -- saving -------------------------------------------------------------------------------------------------------
 
