@@ -7,6 +7,7 @@ from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_skillgraph.arguments import HORIZON, box, find_salience, goal_metric, option_class, option_kwargs
+from sb3_skillgraph.checking import array
 from sb3_skillgraph.goal_env import GoalSpec, find_view
 from sb3_skillgraph.graph import SkillGraph
 from sb3_skillgraph.learning.growth import Growth, Skills
@@ -151,12 +152,13 @@ class Parts:
         """
         transitions = dict(state)
         rows = transitions.pop("rows", {})
-        self.store.set_state(transitions)
+        for id, own in rows.items():
+            array((None,), "i", 0, transitions["total"] - 1)(own, f"The rows of option {id}")
+            if (np.diff(own) <= 0).any():
+                raise ValueError(f"The rows of option {id} in the file are in no order.")
+        self.store.set_state(transitions)  # which checks the rest before it writes anything
         for id, skill in self.runner.skills.items():
-            own = np.asarray(rows.get(id, ()))  # none of a skill that was begun later
-            if own.ndim != 1 or (np.diff(own) <= 0).any() or not ((own >= 0) & (own < self.store.total)).all():
-                raise ValueError(f"The rows of option {id} in the file are none of a replay buffer of this size.")
-            skill.replay.set_state({"rows": own})
+            skill.replay.set_state({"rows": rows.get(id, ())})  # none of a skill that was begun later
 
     def unscale(self, scaled: np.ndarray) -> np.ndarray:
         """Turn actions in [-1, 1], shape ``(n, action_dim)``, into the environment's own, shape ``(n, *action_shape)``."""

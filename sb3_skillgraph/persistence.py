@@ -4,7 +4,6 @@ import io
 import warnings
 from collections import deque
 from collections.abc import Callable, Iterable
-from copy import deepcopy
 from dataclasses import asdict
 from inspect import signature
 from typing import Any, NamedTuple
@@ -20,7 +19,7 @@ from sb3_skillgraph import generators
 from sb3_skillgraph.goal_env import describe_space, make_space, refuse_changed_goals
 from sb3_skillgraph.metric import Metric, as_saved
 from sb3_skillgraph.options.learner import OptionDDPG, OptionLearner, OptionTD3
-from sb3_skillgraph.options.parameters import parameters, set_parameters
+from sb3_skillgraph.options.parameters import set_parameters
 from sb3_skillgraph.rules import PaperRules
 from sb3_skillgraph.saving import MissingCallable, PathOrFile, check_encoding, known_class, load_tree
 from sb3_skillgraph.schema import check_header, check_learned, check_parameters, finite
@@ -274,7 +273,7 @@ def restore_env(agent: Any) -> bool:
 
 
 def load_parameters(learner: OffPolicyAlgorithm, tree: dict[str, Any], exact_match: bool, device: Any) -> None:
-    """Set the parameters that a saved agent has; all of them, or none.
+    """Set the parameters that a saved agent has; all of them, or none: they are checked before anything is set.
 
     :param learner: an SB3 model
     :param tree: what :func:`agent_tree` returned
@@ -282,31 +281,24 @@ def load_parameters(learner: OffPolicyAlgorithm, tree: dict[str, Any], exact_mat
     :param device: torch device
     :raises ValueError: if they do not fit
     """
-    before = deepcopy(parameters(learner))
     try:
         check_parameters(learner, tree["parameters"])
         set_parameters(learner, tree["parameters"], exact_match, device)
     except UNFIT as error:
-        set_parameters(learner, before, True, device)
         raise ValueError(f"The parameters in the file do not fit this agent ({error!r}).") from error
 
 
 def restore_experience(parts: Any, state: dict[str, Any]) -> None:
-    """Give an agent's store the rows of a file; all of them, or none.
+    """Give an agent's store the rows of a file; all of them, or none: they are checked before anything is written.
 
     :param parts: the agent's parts
     :param state: what their ``get_experience`` returned
     :raises ValueError: if they do not fit
     """
-    before = parts.get_experience()
     try:
         parts.set_experience(state)
     except UNFIT as error:
-        parts.set_experience(before)
         raise ValueError(f"The rows in the file do not fit this agent ({error!r}).") from error
-    except ValueError:
-        parts.set_experience(before)
-        raise
 
 
 def kept_by_name(arguments: dict[str, Any]) -> dict[str, Any]:
