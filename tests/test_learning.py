@@ -302,8 +302,9 @@ def test_option_env_is_a_wrapper_with_a_flat_space() -> None:
     assert isinstance(env, gym.Wrapper)
     assert env.observation_space.shape == (6,)
     assert env.observation_space.dtype == np.float32
-    obs, _ = env.reset(seed=0)
+    obs, info = env.reset(seed=0)
     assert env.observation_space.contains(obs)
+    assert info["can_start"]
     assert env.unwrapped is base.unwrapped
 
 
@@ -375,11 +376,13 @@ def test_option_env_is_truncated_with_its_environment() -> None:
 
 def test_option_env_leads_into_the_initiation_set_of_an_option() -> None:
     parent = make_option("o1", "e0", Event("e0", np.array([1.0, 1.0]), 0.45), start=((-0.5, 1.0), 0.4))
-    env = OptionEnv(gym.make(TOY), parent)
-    env.reset(options={"start": parent.initiation.core})
+    env = OptionEnv(gym.make(TOY), parent, initiation=parent.initiation)
+    _, info = env.reset(options={"start": parent.initiation.core})
+    assert info["can_start"]
     _, reward, terminated, _, info = env.step(np.zeros(2, dtype=np.float32))
     assert (reward, terminated, info["is_success"]) == (0.0, True, True)
-    env.reset(options={"start": np.array([1.0, 0.0])})
+    _, info = env.reset(options={"start": np.array([1.0, 0.0])})
+    assert not info["can_start"]
     assert env.step(np.zeros(2, dtype=np.float32))[1:3] == (-1.0, False)
 
 

@@ -18,12 +18,11 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_skillgraph import OptionsEnv, SkillGraphAgent, SMDPQLearning
-from sb3_skillgraph.baselines.flat_policy import FlatPolicy
 from sb3_skillgraph.events import Event
 from sb3_skillgraph.memory.store import TransitionStore
 from sb3_skillgraph.metric import Ball
 from sb3_skillgraph.options.option import Option
-from sb3_skillgraph.smdp import GraphPolicy
+from sb3_skillgraph.smdp import FlatPolicy, GraphPolicy
 
 GAMMA = 0.9
 RADIUS = 0.45

@@ -15,7 +15,6 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.utils import LinearSchedule, polyak_update
 
 from sb3_skillgraph.baselines.covering_replay import CoveringReplay, Everywhere, LowEnd
-from sb3_skillgraph.baselines.flat_policy import FlatPolicy
 from sb3_skillgraph.baselines.goal_conditioned import GoalSchedule
 from sb3_skillgraph.goal_env import GoalSpec
 from sb3_skillgraph.learning.dco import learn_fiedler
@@ -25,7 +24,7 @@ from sb3_skillgraph.options.factory import OptionFactory, copy_policy
 from sb3_skillgraph.options.learner import OptionDDPG, OptionTD3
 from sb3_skillgraph.options.option import Option
 from sb3_skillgraph.options.views import ScaledView, as_view
-from sb3_skillgraph.smdp import OptionsEnv, SMDPQLearning
+from sb3_skillgraph.smdp import FlatPolicy, OptionsEnv, SMDPQLearning
 from sb3_skillgraph.smdp.options_env import MOST_AXES
 
 

@@ -7,6 +7,7 @@ import numpy as np
 from gymnasium import spaces
 
 from sb3_skillgraph.events import Event
+from sb3_skillgraph.options.initiation import InitiationSet
 from sb3_skillgraph.options.option import Option
 from sb3_skillgraph.options.views import ScaledView, View, as_view
 from sb3_skillgraph.options.walk import Walk
@@ -26,6 +27,7 @@ class OptionEnv(gym.Wrapper):
 
     :param env: a goal environment (Dict observations, Box actions)
     :param termination: the event the option leads to, a walk to it, or the option into whose initiation set it leads
+    :param initiation: where the option can start; ``info["can_start"]`` tells after each reset whether it can
     :param timeout: environment steps per run
     :param goal: the point the policy aims at, shape ``(goal_dim,)``; by default that of the termination set
     :param option_view: what the policy sees, as :class:`~sb3_skillgraph.SkillGraphAgent` takes it; by default what the
@@ -43,6 +45,7 @@ class OptionEnv(gym.Wrapper):
         env: gym.Env,
         termination: Event | Option | Walk,
         *,
+        initiation: InitiationSet | None = None,
         timeout: int = 200,
         goal: np.ndarray | None = None,
         option_view: str | View | None = None,
@@ -57,6 +60,7 @@ class OptionEnv(gym.Wrapper):
         if isinstance(termination, Walk):
             termination = termination.termination
         self.termination = termination
+        self.initiation = initiation
         self.timeout = timeout
         if goal is None:
             goal = termination.initiation.core if isinstance(termination, Option) else termination.center
@@ -76,12 +80,14 @@ class OptionEnv(gym.Wrapper):
 
         :param seed: seeds the wrapped environment, which is then reset
         :param options: passed to the wrapped environment, which is then reset
-        :return: what the policy sees, and info
+        :return: what the policy sees, and ``info`` with ``can_start``
         """
         info: dict[str, Any] = {}
         if self._last is None or seed is not None or options is not None:
             self._last, info = self.env.reset(seed=seed, options=options)
         self._steps = 0
+        point = np.asarray(self._last["achieved_goal"])[None]
+        info["can_start"] = self.initiation is None or bool(self.initiation.optimistic(point)[0])
         return self._see(self._last), info
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
