@@ -648,7 +648,7 @@ class SkillGraphAgent(OffPolicyAlgorithm):
         env = self._wrap_env(env, self.verbose)
         if env.num_envs != self.n_envs:
             raise ValueError(
-                f"set_env takes as many environments as the agent has, {self.n_envs}, not {env.num_envs}: load(path, env=env) "
+                f"The number of environments must stay {self.n_envs} in set_env, not become {env.num_envs}: load(path, env=env) "
                 "takes any number."
             )
         super().set_env(env, force_reset)
