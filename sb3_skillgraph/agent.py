@@ -648,8 +648,8 @@ class SkillGraphAgent(OffPolicyAlgorithm):
         env = self._wrap_env(env, self.verbose)
         if env.num_envs != self.n_envs:
             raise ValueError(
-                f"The number of environments must stay {self.n_envs} in set_env, not become {env.num_envs}: load(path, env=env) "
-                "takes any number."
+                f"The number of environments must stay {self.n_envs} in set_env, not become {env.num_envs}: "
+                "load(path, env=env) takes any number."
             )
         super().set_env(env, force_reset)
         self._heed_time_limit()
