@@ -37,10 +37,11 @@ class GoalSpec(NamedTuple):
                 "sb3_skillgraph.envs.PursueGoals makes one."
             )
         boxes = [observation_space[key] for key in KEYS]
-        if not all(isinstance(box, spaces.Box) for box in observation_space.spaces.values()):
+        others = [key for key, entry in observation_space.spaces.items() if not isinstance(entry, spaces.Box)]
+        if others:
             raise ValueError(
-                f"SkillGraphAgent needs {wanted}; this environment has {observation_space}. Where goals are Dicts, "
-                "sb3_skillgraph.envs.FlattenGoals makes vectors of them."
+                f"SkillGraphAgent needs {wanted}, and Boxes only; {others} are none in {observation_space}. Where goals are "
+                "Dicts, sb3_skillgraph.envs.FlattenGoals makes vectors of them."
             )
         shapes = [box.shape for box in boxes]
         if shapes[1] != shapes[2] or shapes[1] is None or len(shapes[1]) != 1 or shapes[1][0] == 0:
