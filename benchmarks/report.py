@@ -235,9 +235,9 @@ def older() -> str:
     return "; ".join(parts)
 
 
-def wall_clock() -> str:
-    """Return the seconds to success."""
-    tasks = {name: runs for name, runs in document("wall_clock.json").items() if isinstance(runs, list)}
+def wall_clock(file: str) -> str:
+    """Return the seconds to success, and the success of DDPG with hindsight after as many where it was run."""
+    tasks = {name: runs for name, runs in document(file).items() if isinstance(runs, list)}
     parts = []
     for name, runs in tasks.items():
         seconds = ", ".join(f"{run['seconds']:.0f}" for run in runs)
