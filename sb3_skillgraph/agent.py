@@ -378,8 +378,8 @@ class SkillGraphAgent(OffPolicyAlgorithm):
         for option, n_updates in self.parts.learners(gradient_steps):
             if n_updates > 0 and option.replay.size() >= batch_size:
                 self._train(option.learner, n_updates, batch_size)
-        # What predict acts by follows
-        self.parts.average.follow(gradient_steps)
+            if option is self.parts.walker:
+                self.parts.average.follow(n_updates)  # what predict acts by
         self._n_updates += gradient_steps
         self.graph.now = float(self._n_updates)  # records age as the walker learns
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")

@@ -287,9 +287,9 @@ def judge(agent: PolicyPredictor, env: gym.Env) -> Callable[..., bool]:
         for name in ("is_success", "success"):
             if name in info:
                 return bool(info[name])
-        if metric is None and begins:
-            return False  # many tell it with a step only
         if metric is None:
+            if begins:
+                return False  # many tell it with a step only
             raise ValueError(f"{env} does not tell when a goal is reached: it has no radius, and says nothing in its info.")
         return metric.reached(observation["achieved_goal"], observation["desired_goal"])
 

@@ -82,8 +82,8 @@ class Parts:
         self.model = WalkModel(self.metric.n_matched)
         self.planner = Planner(self.graph, self.model, HORIZON)
         self.skills = Skills(self.graph, self.factory, self.walker)
-        runs = self.graph, self.planner
-        self.runner = Runner(*runs, self.average.actor, self.view, self.skills, second=self.walker.actor)
+        second = self.walker.actor
+        self.runner = Runner(self.graph, self.planner, self.average.actor, self.view, self.skills, second=second)
         self.missions = Missions(
             self.graph,
             find_salience(arguments, self.graph, self.store, agent),
@@ -94,7 +94,7 @@ class Parts:
         growth = Growth(arguments["skills"], self.graph, self.skills)
         self.witness = Witness(self.graph, self.planner.choice_model, agent.n_envs, growth)
         # Who learns acts by the policy as it is.
-        return Runner(*runs, self.walker.actor, self.view, self.skills)
+        return Runner(self.graph, self.planner, self.walker.actor, self.view, self.skills)
 
     def options(self) -> Any:
         """Return all options: the walks, one to each event, which share their SB3 model."""

@@ -191,10 +191,8 @@ class Rollout:
         if self.store.total - len(points) < LOOK_AT <= self.store.total:
             tell_scale(self.store, self.runner.graph.metric)
         cut = dones & ~terminated & ~stuck
-        if cut.any():
-            self.longest = max(self.longest, int(step.state.elapsed[cut].max()))
-            if not self.is_told_limit:
-                self.runner.planner.horizon = self.longest
+        if not self.is_told_limit and cut.any():
+            self.runner.planner.horizon = self.longest = max(self.longest, int(step.state.elapsed[cut].max()))
         # Which options have begun with this step, and which have ended
         for i in np.flatnonzero(step.state.steps == 1).tolist():
             self.witness.began(i, step.observation["achieved_goal"][i])

@@ -151,7 +151,7 @@ class TransitionStore:
         :param rng: random generator
         :return: row numbers
         """
-        last = self._last_row[self._trajectory[rows % self.capacity]]
+        last = self._last_row[self.trajectory(rows)]
         ahead = np.minimum((last - rows) // self.n_envs, horizon - 1)
         return rows + rng.integers(0, ahead + 1) * self.n_envs
 
@@ -165,7 +165,7 @@ class TransitionStore:
             "columns": {name: self.column(name, rows) for name in _COLUMNS},
             "terminated": self.terminated(rows),
             "stuck": self.stuck(rows),
-            "trajectory": self._trajectory[rows % self.capacity],
+            "trajectory": self.trajectory(rows),
             "current": self._current,
             "n_trajectories": self._n_trajectories,
             "last_row": self._last_row[: self._n_trajectories],

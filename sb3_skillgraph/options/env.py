@@ -7,13 +7,11 @@ import numpy as np
 from gymnasium import spaces
 
 from sb3_skillgraph.events import Event
+from sb3_skillgraph.memory.replay import OptionRule
 from sb3_skillgraph.options.initiation import InitiationSet
 from sb3_skillgraph.options.option import Option
 from sb3_skillgraph.options.views import ScaledView, View, as_view
 from sb3_skillgraph.options.walk import Walk
-
-#: Pay for getting stuck: a hundred steps', or that of standing there for ever at a discount of 0.99.
-STUCK_REWARD = -100.0
 
 
 class OptionEnv(gym.Wrapper):
@@ -70,6 +68,7 @@ class OptionEnv(gym.Wrapper):
         if option_view is None and env.has_wrapper_attr("option_view"):
             option_view = env.get_wrapper_attr("option_view")
         self.view = ScaledView(as_view(option_view), termination.metric)
+        self.rule = OptionRule(termination.metric, termination=termination)
         dims = [int(np.prod(space[key].shape)) for key in ("observation", "achieved_goal")]  # type: ignore[arg-type]
         self.observation_space = spaces.Box(-np.inf, np.inf, (self.view.dim(*dims),), np.float32)
         self._last: dict[str, np.ndarray] | None = None
@@ -101,9 +100,11 @@ class OptionEnv(gym.Wrapper):
         self._steps += 1
         stuck = bool(info.get("stuck"))
         success = not stuck and self.termination.holds(np.asarray(observation["achieved_goal"]))
-        reward = STUCK_REWARD if stuck else -1.0 + success
-        self._last = None if stuck or terminated or truncated else observation
         over = success or stuck or terminated
+        before, after = (np.asarray(each["achieved_goal"])[None] for each in (self._last, observation))
+        reached, ended, lost = np.array([[success], [over], [stuck]])
+        reward = float(self.rule.reward(reached, ended, lost, before, after, self.goal[None])[0])
+        self._last = None if stuck or terminated or truncated else observation
         cut = not (success or stuck) and (self._steps >= self.timeout or truncated)
         return self._see(observation), reward, over, cut, {**info, "is_success": success}
 
