@@ -447,7 +447,7 @@ def test_adapt_looks_for_a_way_from_the_event_nearest_to_an_unknown_goal(trained
         pursued.update(tuple(mission.goal) for mission in trained.parts.missions.current if mission is not None)
         return True
 
-    trained.adapt(goal, total_timesteps=300, callback=note)
+    trained.adapt(goal, total_timesteps=1000, callback=note)
     assert tuple(goal) in pursued
     assert tuple(nearest.center) in pursued
 
@@ -490,6 +490,7 @@ def test_adapt_from_inside_a_wall(trained: SkillGraphAgent) -> None:
 
 
 def test_plans_are_about_the_episodes_of_the_test(trained: SkillGraphAgent) -> None:
+    trained.learn(3000, reset_num_timesteps=False)  # who has hardly been trained promises too little
     env = gym.make(TOY, max_steps=40)
     before = trained.parts.planner.horizon
     result = evaluate_pairs(trained, env, n_pairs=20)

@@ -22,6 +22,7 @@ from sb3_skillgraph.envs.maze_geometry import U_MAZE
 from sb3_skillgraph.planning import DIRECT
 from sb3_skillgraph.plotting import event_links, near_links, plot_plan, plot_skill_graph, run_plan, save_figure
 from sb3_skillgraph.plotting.figures import project
+from sb3_skillgraph.plotting.plan import MAX_NAMED
 from sb3_skillgraph.plotting.skill_graph import NEAREST, SURE, EventLink
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
@@ -172,7 +173,7 @@ def test_every_run_is_drawn_and_the_plan_beside_it(agent: SkillGraphAgent, env: 
     targets = {option.id: option.target for option in agent.options}
     labels = ["walk to the goal itself" if run == DIRECT else f"{run} to {targets[run]}" for run in runs]
     planned, *walked, start, goal = axes.lines
-    assert [line.get_label() for line in walked] == labels
+    assert [line.get_label() for line in walked][:MAX_NAMED] == labels[:MAX_NAMED]
     np.testing.assert_allclose(np.concatenate([line.get_xydata()[1:] for line in walked]), trajectory.points[1:])
     assert planned.get_linestyle() == "--"
     stops = [

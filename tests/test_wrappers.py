@@ -308,7 +308,7 @@ def test_two_functions_make_a_goal_environment_of_any() -> None:
 def test_an_agent_learns_to_pursue_the_goals() -> None:
     env = pursuing(achieved_goal=lambda o: o, sample_goal=lambda rng: rng.uniform(-4.0, 4.0, 1))
     nets = dict(policy_kwargs=dict(net_arch=[32, 32]), batch_size=32)
-    agent = SkillGraphAgent("MultiInputPolicy", env, learning_starts=300, seed=0, **nets).learn(2_000)
+    agent = SkillGraphAgent("MultiInputPolicy", env, learning_starts=300, seed=0, **nets).learn(4_000)
     assert evaluate_pairs(agent, env, n_pairs=20).success_rate >= 0.8
 
 
