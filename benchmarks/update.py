@@ -36,7 +36,7 @@ from stable_baselines3.common.logger import Logger
 from torch import nn
 
 from sb3_skillgraph import SkillGraphAgent
-from sb3_skillgraph.options.blas import multiply
+from sb3_skillgraph.options.kernel import multiply
 from sb3_skillgraph.options.learner import OptionDDPG, OptionTD3
 
 ENV = "SkillGraph/PointMazeMedium-v0"

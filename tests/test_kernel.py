@@ -10,7 +10,7 @@ from gymnasium import spaces
 from learners import by_torch, distance, fill, make, same, train
 from stable_baselines3.common.buffers import ReplayBuffer
 
-from sb3_skillgraph.options import blas
+from sb3_skillgraph.options import blas, kernel
 from sb3_skillgraph.options.compiling import compiled
 from sb3_skillgraph.options.learner import OptionDDPG, OptionTD3
 
@@ -336,7 +336,7 @@ def test_a_moment_that_is_missing_is_named():
 
 @compiled
 def multiply(left, right, left_turned, right_turned):
-    return blas.product(left, right, left_turned, right_turned)
+    return kernel.product(left, right, left_turned, right_turned)
 
 
 @pytest.mark.parametrize("left_turned", [False, True])

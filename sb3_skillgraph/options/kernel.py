@@ -3,7 +3,8 @@ The update of DDPG and TD3 in one compiled function, for networks of Linear and 
 
 The numbers are those of ``OptionLearner._update_by_torch``, which is the one to read first. BLAS does the matrix
 products, torch's own where it can be found, and loops do all else: what belongs to a layer is touched while it is in the
-cache, and loops are compiled in less time than expressions of arrays.
+cache, and loops are compiled in less time than expressions of arrays. All of it stands in this file: numba keeps what it
+has compiled until the file changes, not what that calls in others.
 """
 
 import math
@@ -13,7 +14,7 @@ import numpy as np
 from numba import carray, types
 from numba.extending import intrinsic
 
-from sb3_skillgraph.options.blas import product
+from sb3_skillgraph.options.blas import sgemm
 from sb3_skillgraph.options.compiling import compiled, inner
 
 Network = list[np.ndarray]  # weight (out, in) and bias (1, out) of each layer
@@ -22,6 +23,65 @@ Places = np.ndarray  # of a learner's arrays in memory: address, rows and column
 Rates = tuple[float, float, float, float, float]  # Adam's learning rate, betas and epsilon; tau, 0 for no target to move
 # Observations, actions, next observations, noise on next actions, rewards, discounts (0 after an end): (batch, width).
 Batch = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+#: Columns of a result up to which turning it pays: BLAS takes its columns for rows, and is slow where they are so short.
+NARROW = 12
+
+
+@inner
+def multiply(left: np.ndarray, right: np.ndarray, left_turned: bool, right_turned: bool) -> np.ndarray:
+    """
+    :param left: (m, k), or (k, m) if it is to be transposed
+    :param right: (k, n), or (n, k) if it is to be transposed
+    :param left_turned: whether it is
+    :param right_turned: whether it is
+    :return: (m, n)
+    """
+    m, k = (left.shape[1], left.shape[0]) if left_turned else left.shape
+    n = right.shape[0] if right_turned else right.shape[1]
+    result = np.empty((m, n), np.float32)
+    # BLAS goes by columns, and sees every matrix transposed: the right one comes first. Whole numbers of 64 bits are read
+    # right by one that expects 32, too, where the low ones come first.
+    turn = np.array([ord("T") if right_turned else ord("N"), ord("T") if left_turned else ord("N")], np.uint8)
+    sizes = np.array([n, m, k, right.shape[1], left.shape[1]], np.int64)
+    factors = np.array([1.0, 0.0], np.float32)
+    sgemm(
+        turn.ctypes,
+        turn[1:].ctypes,
+        sizes.ctypes,
+        sizes[1:].ctypes,
+        sizes[2:].ctypes,
+        factors.ctypes,
+        right.ctypes,
+        sizes[3:].ctypes,
+        left.ctypes,
+        sizes[4:].ctypes,
+        factors[1:].ctypes,
+        result.ctypes,
+        sizes.ctypes,
+    )
+    return result
+
+
+@inner
+def product(left: np.ndarray, right: np.ndarray, left_turned: bool, right_turned: bool) -> np.ndarray:
+    """
+    :param left: (m, k), or (k, m) if it is to be transposed
+    :param right: (k, n), or (n, k) if it is to be transposed
+    :param left_turned: whether it is
+    :param right_turned: whether it is
+    :return: (m, n)
+    """
+    m = left.shape[1] if left_turned else left.shape[0]
+    n = right.shape[0] if right_turned else right.shape[1]
+    if not 1 < n <= NARROW < m:
+        return multiply(left, right, left_turned, right_turned)
+    # The same the other way round, from an eighth to a half of the time
+    turned = multiply(right, left, not right_turned, not left_turned)
+    result = np.empty((m, n), np.float32)
+    for i in range(m):
+        for j in range(n):
+            result[i, j] = turned[j, i]
+    return result
 
 
 @inner
