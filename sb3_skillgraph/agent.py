@@ -31,7 +31,6 @@ from sb3_skillgraph.goal_env import (
     env_attribute,
     refuse_changed_goals,
     rows,
-    with_terminal,
 )
 from sb3_skillgraph.interrupts import Interrupts
 from sb3_skillgraph.learning.episodes import Episodes
@@ -156,27 +155,10 @@ class SkillGraphAgent(OffPolicyAlgorithm):
         refuse_changed_goals(env)
         if env is not None and not isinstance(env, str):
             GoalSpec.of(env.observation_space, env.action_space)  # before SB3 asserts less clearly
-        super().__init__(
-            policy=policy,
-            env=env,  # type: ignore[arg-type]
-            learning_rate=learning_rate,
-            buffer_size=buffer_size,
-            learning_starts=learning_starts,
-            batch_size=batch_size,
-            tau=tau,
-            gamma=gamma,
-            train_freq=train_freq,
-            gradient_steps=gradient_steps,
-            action_noise=action_noise if isinstance(action_noise, ActionNoise) else None,
-            policy_kwargs=policy_kwargs,
-            stats_window_size=stats_window_size,
-            tensorboard_log=tensorboard_log,
-            verbose=verbose,
-            device=device,
-            seed=seed,
-            sde_support=False,
-            support_multi_env=True,
-        )
+        shared = signature(OffPolicyAlgorithm.__init__).parameters
+        sb3s = {name: value for name, value in self._arguments.items() if name in shared}
+        sb3s["action_noise"] = action_noise if isinstance(action_noise, ActionNoise) else None
+        super().__init__(env=env, **sb3s, sde_support=False, support_multi_env=True)  # type: ignore[arg-type]
         if rules is not None and not isinstance(rules, PaperRules):
             raise ValueError(f"rules must be PaperRules() or None, not {rules!r}: SkillGraphAgent(..., **PAPER).")
         self.rules = rules
@@ -202,7 +184,12 @@ class SkillGraphAgent(OffPolicyAlgorithm):
         self.set_random_seed(self.seed)
         self._convert_train_freq()
         self._spec = GoalSpec.of(self.observation_space, self.action_space)
-        self.parts = self._build_parts()
+        if self.rules is None:
+            self.parts: Any = Parts(self, self._spec, self._arguments)
+        else:
+            from sb3_skillgraph.paper.parts import PaperParts  # when it is used: networkx takes a while to import
+
+            self.parts = PaperParts(self, self._spec, self._arguments)
         self._heed_time_limit()
         # Under SB3's names as well: CheckpointCallback looks for the one, users for the other.
         self.replay_buffer = self.parts.store
@@ -215,13 +202,6 @@ class SkillGraphAgent(OffPolicyAlgorithm):
         if isinstance(observation, dict):
             return self.predict(observation, *args, **kwargs)
         return type(self.policy).predict(self.policy, observation, *args, **kwargs)
-
-    def _build_parts(self) -> Any:
-        if self.rules is None:
-            return Parts(self, self._spec, self._arguments)
-        from sb3_skillgraph.paper.parts import PaperParts  # when it is used: networkx takes a while to import
-
-        return PaperParts(self, self._spec, self._arguments)
 
     def _heed_time_limit(self) -> None:
         """Make plans for the episodes of the environment: as long as it tells, else as those that it cuts while learning."""
@@ -302,7 +282,8 @@ class SkillGraphAgent(OffPolicyAlgorithm):
         rollout = self.parts.rollout
         if not reset_num_timesteps:
             # A call may overshoot by part of a roll-out; two calls of N then still end where one of 2N does.
-            total_timesteps -= max(0, min(self.num_timesteps - self._total_timesteps, self.n_envs * self._chunk()))
+            chunk = self.train_freq.frequency if self.train_freq.unit.value == "step" else 0  # type: ignore[union-attr]
+            total_timesteps -= max(0, min(self.num_timesteps - self._total_timesteps, self.n_envs * chunk))
         if rollout.pending is not None:  # the last call ended between a step and its storing: that step never was
             self.parts.rng.bit_generator.state = rollout.pending.rng_state
             self._last_obs = None
@@ -320,9 +301,6 @@ class SkillGraphAgent(OffPolicyAlgorithm):
             self._last_obs = first
             rollout.begin_anew(rows(first, "achieved_goal"))
         return total, callback
-
-    def _chunk(self) -> int:
-        return self.train_freq.frequency if self.train_freq.unit.value == "step" else 0  # type: ignore[union-attr]
 
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
@@ -348,9 +326,8 @@ class SkillGraphAgent(OffPolicyAlgorithm):
         # An end for good is worth nothing more, a time limit ends only the episode, and who is stuck is given up here
         stuck = np.array([bool(info.get("stuck")) for info in infos])
         terminated = self.episodes.terminated(dones, infos)
-        new_obs = self.episodes.start_over(new_obs, dones, stuck, infos)
         # A VecEnv shows how the next episode begins where one has ended: what is stored is what the step led to
-        reached = with_terminal(new_obs, dones, infos)
+        new_obs, reached = self.episodes.start_over(new_obs, dones, stuck, infos)
         # Nothing is stored of a step that cannot be learned from
         check_finite(new_obs, self.num_timesteps)
         if reached is not new_obs:
@@ -360,7 +337,7 @@ class SkillGraphAgent(OffPolicyAlgorithm):
             observations = {key: rows(reached, key) for key in ("observation", "achieved_goal")}
             self.parts.rollout.observe(observations, terminated, dones, stuck)
             for i in np.flatnonzero(dones).tolist():
-                self.parts.rollout.begin_episode(i, rows(new_obs, "achieved_goal")[i])
+                self.parts.witness.begin(i, rows(new_obs, "achieved_goal")[i])
             self._last_obs = new_obs
 
     def train(self, gradient_steps: int, batch_size: int = 100) -> None:
@@ -546,9 +523,6 @@ class SkillGraphAgent(OffPolicyAlgorithm):
             self.episodes.reset_options, self._last_obs = {}, None
 
     # -- saving and loading -------------------------------------------------------------------------------------------
-
-    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
-        return self.parts.walker.learner._get_torch_save_params()
 
     def get_parameters(self) -> dict[str, Any]:
         """Return the parameters of the walker's networks and optimisers: state dicts under SB3's names."""

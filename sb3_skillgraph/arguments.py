@@ -4,13 +4,13 @@ from inspect import signature
 from typing import Any
 
 import numpy as np
-from gymnasium import spaces
 from stable_baselines3 import DDPG, SAC, TD3
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import TrainFreq
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_skillgraph.checking import MOST, Check, anything, dict_of, number, one_of, optional, whole
 from sb3_skillgraph.envs.metrics import env_metric
 from sb3_skillgraph.goal_env import Oracle, env_attribute
 from sb3_skillgraph.graph import SkillGraph
@@ -30,7 +30,6 @@ NET_ARCH = [128, 128]  # of the walker's networks
 SATURATION_PENALTY = 1e-4
 #: Environment steps within which a goal is to be reached, where the environment has shown no time limit.
 HORIZON = 1_000
-SKILLS = ("where_needed", "always", "never")  # when walks get a network of their own
 OPTION_CLASSES: dict[str, type[OffPolicyAlgorithm]] = {cls.__name__: cls for cls in (OptionDDPG, OptionTD3, DDPG, TD3, SAC)}
 
 
@@ -46,24 +45,29 @@ def option_class(given: type[OffPolicyAlgorithm] | str) -> type[OffPolicyAlgorit
     raise ValueError(f"option_class is {given!r}: it must be an SB3 off-policy class, or one of {', '.join(OPTION_CLASSES)}.")
 
 
-_RANGES: dict[str, tuple[float, float]] = {
-    "tau": (0, 1),
-    "gamma": (0, 1),
-    "action_noise": (0, 1e6),
-    "explore_beyond": (0, 1e6),
-    "hindsight": (0, 1),
-    "goal_tolerance": (1e-6, 1),
-    "shaping": (0, 1e6),
-}
-_WHOLE: dict[str, tuple[int, int]] = {
-    "learning_starts": (0, 2**62),
-    "buffer_size": (1, 2**62),
-    "batch_size": (1, 2**62),
-    "gradient_steps": (-1, 100_000),  # a call of train must end
-    "stats_window_size": (1, 2**62),
-    "max_events": (8, 2**62),
-    "walk_steps": (1, 2**62),
-    "exploration_steps": (1, 2**62),
+#: What arguments may be that are numbers, or one of some values.
+_CHECKS: dict[str, Check] = {
+    "learning_rate": number(0, FASTEST),
+    "tau": number(0, 1),
+    "gamma": number(0, 1),
+    "action_noise": number(0, 1e6),
+    "explore_beyond": number(0, 1e6),
+    "hindsight": number(0, 1),
+    "goal_tolerance": number(1e-6, 1),
+    "shaping": number(0, 1e6),
+    "learning_starts": whole(),
+    "buffer_size": whole(1),
+    "batch_size": whole(1),
+    "gradient_steps": whole(-1, 100_000),  # a call of train must end
+    "stats_window_size": whole(1),
+    "max_events": whole(8),
+    "walk_steps": whole(1),
+    "exploration_steps": whole(1),
+    "seed": optional(whole(-MOST)),
+    "verbose": optional(whole(-MOST)),
+    "option_kwargs": optional(dict_of(anything)),
+    "policy_kwargs": optional(dict_of(anything)),
+    "skills": one_of("where_needed", "always", "never"),  # when walks get a network of their own
 }
 
 
@@ -73,32 +77,18 @@ def check_arguments(arguments: dict[str, Any]) -> None:
     :param arguments: the agent's keyword arguments
     :raises ValueError: naming the argument and what it may be
     """
-    noise, train_freq = arguments["action_noise"], arguments["train_freq"]
-    given = {**arguments, "action_noise": 0.0 if noise is None or isinstance(noise, ActionNoise) else noise}
-    for ranges, kinds, what in ((_RANGES, (int, float, np.number), "a number"), (_WHOLE, (int, np.integer), "a whole number")):
-        for name, (low, high) in ranges.items():
-            value = given[name]
-            if isinstance(value, bool) or not isinstance(value, kinds) or not low <= value <= high:
-                upper = f"to {high:g}" if high < 1e6 else "on"
-                raise ValueError(f"{name} must be {what} from {low:g} {upper}, not {value!r}.")
-    rate = arguments["learning_rate"]
-    is_rate = isinstance(rate, int | float | np.number) and not isinstance(rate, bool) and 0 <= rate <= FASTEST
-    if not callable(rate) and not is_rate:
-        raise ValueError(f"learning_rate must be a number from 0 to {FASTEST}, or a schedule, not {rate!r}.")
+    given, train_freq = dict(arguments), arguments["train_freq"]
+    if callable(given["learning_rate"]):
+        given["learning_rate"] = 0.0
+    if given["action_noise"] is None or isinstance(given["action_noise"], ActionNoise):
+        given["action_noise"] = 0.0
+    for name, check in _CHECKS.items():
+        check(given[name].item() if isinstance(given[name], np.generic) else given[name], name)
     if isinstance(train_freq, tuple) and len(train_freq) != 2:
         raise ValueError(f"train_freq must be a number of steps, or such as (1, 'episode'), not {train_freq!r}.")
     frequency = train_freq[0] if isinstance(train_freq, tuple) else train_freq
     if isinstance(frequency, int) and (isinstance(frequency, bool) or not 1 <= frequency <= LONGEST_ROLLOUT):
         raise ValueError(f"train_freq must be from 1 to {LONGEST_ROLLOUT}, not {train_freq!r}.")
-    for name in ("option_kwargs", "policy_kwargs"):
-        if arguments[name] is not None and not isinstance(arguments[name], dict):
-            raise ValueError(f"{name} must be a dictionary of keyword arguments, not {arguments[name]!r}.")
-    for name in ("seed", "verbose"):
-        value = arguments[name]
-        if value is not None and (isinstance(value, bool) or not isinstance(value, int | np.integer)):
-            raise ValueError(f"{name} must be a whole number, not {value!r}.")
-    if arguments["skills"] not in SKILLS:
-        raise ValueError(f"skills must be one of {', '.join(map(repr, SKILLS))}, not {arguments['skills']!r}.")
 
 
 def check_attributes(agent: OffPolicyAlgorithm) -> None:
@@ -117,15 +107,6 @@ def check_attributes(agent: OffPolicyAlgorithm) -> None:
             f"agent.train_freq must be SB3's, such as TrainFreq(4, TrainFrequencyUnit.STEP), not {train_freq!r}: a number is "
             "for the constructor."
         )
-
-
-def box(space: spaces.Space) -> spaces.Box:
-    """Return an action space, which has been seen to be a box.
-
-    :param space: the space
-    """
-    assert isinstance(space, spaces.Box)
-    return space
 
 
 def goal_metric(given: Any, env: VecEnv | None, goal_dim: int) -> Metric:

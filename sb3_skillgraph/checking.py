@@ -29,25 +29,21 @@ def refuse(where: str, wanted: str, value: Any) -> None:
     raise ValueError(f"{where} must be {wanted}, not {text}.")
 
 
-def number(low: float = -np.inf, high: float = np.inf) -> Check:
+def number(low: float = -np.inf, high: float = np.inf, kinds: Any = int | float, what: str = "a number") -> Check:
     """Check a finite number in a range."""
+    upper = " on" if high >= MOST else f" to {high:g}"
+    wanted = what if low <= -MOST else f"{what} from {low:g}{upper}"
 
     def check(value: Any, where: str) -> None:
-        ok = isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < np.inf and low <= value <= high
-        if not ok:
-            refuse(where, f"a number from {low:g} to {high:g}", value)
+        if not isinstance(value, kinds) or isinstance(value, bool) or not low <= value <= high or abs(value) == np.inf:
+            refuse(where, wanted, value)
 
     return check
 
 
 def whole(low: int = 0, high: int = MOST) -> Check:
     """Check a whole number in a range."""
-
-    def check(value: Any, where: str) -> None:
-        if not isinstance(value, int) or isinstance(value, bool) or not low <= value <= high:
-            refuse(where, f"a whole number from {low} to {high}", value)
-
-    return check
+    return number(low, high, int, "a whole number")
 
 
 def flag(value: Any, where: str) -> None:
@@ -108,24 +104,13 @@ def list_of(check: Check, length: int | None = None, kind: type[list[Any] | tupl
     return check_all
 
 
-def some(check: Check) -> Check:
-    """Check a list that is not empty."""
-
-    def check_some(value: Any, where: str) -> None:
-        check(value, where)
-        if not value:
-            refuse(where, "a list that is not empty", value)
-
-    return check_some
-
-
-def at_most(n: int, check: Check) -> Check:
-    """Check what may have so many rows."""
+def sized(check: Check, least: int, most: int = MOST) -> Check:
+    """Check what may have from so many rows to so many."""
 
     def check_length(value: Any, where: str) -> None:
         check(value, where)
-        if len(value) > n:
-            refuse(where, f"of {n} rows at most", value)
+        if not least <= len(value) <= most:
+            refuse(where, f"of {least} to {most} rows", value)
 
     return check_length
 
@@ -180,7 +165,7 @@ def tensor(shape: tuple[int, ...], low: float, high: float) -> Check:
     """Check a tensor, or an array, of finite numbers."""
 
     def check(value: Any, where: str) -> None:
-        held = value.numpy() if isinstance(value, th.Tensor) else value
+        held = value.detach().cpu().numpy() if isinstance(value, th.Tensor) else value
         array(shape, "fiu", low, high)(held, where)
 
     return check

@@ -1,9 +1,11 @@
 """What an agent could do in each event, and what would come of it: the model that plans are made on."""
 
+from typing import Any
+
 import numpy as np
 
 from sb3_skillgraph.choices import GUESS_RUNS, Choices, Runs, Start
-from sb3_skillgraph.edges import NOWHERE
+from sb3_skillgraph.edges import MAX_LANDINGS, NOWHERE, land
 from sb3_skillgraph.graph import SkillGraph
 from sb3_skillgraph.walk_model import Kind, WalkModel, timeout
 
@@ -33,10 +35,10 @@ class ChoiceModel:
     def __init__(self, graph: SkillGraph, model: WalkModel) -> None:
         self.graph = graph
         self.model = model
-        self._known: tuple[tuple[int, int], Choices, ByEnd] | None = None
+        self._known: tuple[tuple[Any, int], Choices, ByEnd] | None = None
 
     @property
-    def version(self) -> tuple[int, int]:
+    def version(self) -> tuple[Any, int]:
         """Changes whenever something is learned."""
         return self.graph.version, self.model.version
 
@@ -156,9 +158,12 @@ class ChoiceModel:
     @staticmethod
     def _add_episode(choices: Choices, events: np.ndarray, runs: Runs) -> None:
         """Add the episode's runs to choices, in place; they are recorded for the events that these begin in."""
-        for i, (event, target) in enumerate(zip(events.tolist(), choices.target.tolist(), strict=True)):
-            for success, landing, number in runs.of(event, target):
-                choices.add_runs(i, success, landing, EPISODE_WEIGHT * number)
+        for event, target, success, landing, number in zip(*(column.tolist() for column in runs), strict=True):
+            weight = EPISODE_WEIGHT * number
+            for row in np.flatnonzero((events == event) & (choices.target == target)).tolist():
+                (choices.successes if success else choices.failures)[row] += weight
+                if not success:
+                    land(choices.landing[row], choices.weight[row], landing, weight)
 
     def _edges(self, chosen: np.ndarray, replaced: np.ndarray, tried: Choices) -> Choices:
         """Return some of the graph's edges, with what the episode has shown of them."""
@@ -262,20 +267,10 @@ class ChoiceModel:
         n, metric = len(source), self.graph.metric
         distance, changes = metric.travel(begin, end), metric.mismatches(begin, end)
         kind = Kind(distance, seen * self.model.steps_per_radius * distance, seen, np.zeros(n), changes)
-        landing = np.full((n, self.graph.edges.landing.shape[1]), NOWHERE)
-        targets = np.broadcast_to(np.asarray(target), (n,)).copy()
-        zeros, steps = (np.zeros(n), np.zeros(n)), self.model.steps(kind)
-        guessed = Choices(
-            source,
-            targets,
-            self.model.success(kind),
-            *zeros,
-            steps,
-            self.model.patience * timeout(steps),
-            self._loss(kind),
-            landing,
-            np.zeros(landing.shape),
-        )
+        steps = self.model.steps(kind)
+        runs_known = np.zeros(n), np.zeros(n), steps, self.model.patience * timeout(steps)
+        landings = np.full((n, MAX_LANDINGS), NOWHERE), np.zeros((n, MAX_LANDINGS))
+        guessed = Choices(source, np.full(n, target), self.model.success(kind), *runs_known, self._loss(kind), *landings)
         self._add_episode(guessed, event, runs)
         return guessed
 

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_skillgraph.edges import NOWHERE, land
+from sb3_skillgraph.edges import NOWHERE
 
 #: What to count on for the success of options, in standard deviations above what is expected: while learning, so that what is
 #: unknown is tried, and otherwise, so that it is not relied upon.
@@ -28,11 +28,6 @@ class Runs(NamedTuple):
     success: np.ndarray
     landing: np.ndarray
     number: np.ndarray
-
-    def of(self, source: int, target: int) -> list[tuple[bool, int, int]]:
-        """Return success, landing and number of the runs of one option from one event."""
-        rows = np.flatnonzero((self.source == source) & (self.target == target))
-        return [(bool(self.success[i]), int(self.landing[i]), int(self.number[i])) for i in rows]
 
 
 NO_RUNS = Runs(*np.zeros((5, 0), dtype=np.int64))
@@ -99,6 +94,19 @@ class Choices(NamedTuple):
         share = np.concatenate([self.weight, np.stack([1.0 - self.loss, self.loss], axis=1)], axis=1)
         return landing, share / share.sum(axis=1, keepdims=True)
 
+    def outcomes(self, stance: float, for_good: np.ndarray | float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+        """Return where runs end, and how likely each end is: the target first, then the landings of failures.
+
+        :param stance: how many standard deviations above the mean the success is to be
+        :param for_good: share of the failures of each, if it always fails, that are left out: they happen again and again
+        :return: vertices and probabilities, both of shape ``(n, m + 1)``
+        """
+        success = self.success(stance)
+        landing, share = self.landings()
+        share = (1.0 - for_good * (1.0 - success))[:, None] * share
+        probability = np.concatenate([success[:, None], (1.0 - success)[:, None] * share], axis=1)
+        return np.concatenate([self.target[:, None], landing], axis=1), probability
+
     def take(self, rows: np.ndarray) -> "Choices":
         """Return a copy of some of the rows."""
         return Choices(*(column[rows] for column in self))
@@ -107,11 +115,3 @@ class Choices(NamedTuple):
     def join(parts: list["Choices"]) -> "Choices":
         """Return the rows of all parts, one after the other."""
         return Choices(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
-
-    def add_runs(self, row: int, success: bool, landing: int, weight: float) -> None:
-        """Add runs to a row, in place."""
-        if success:
-            self.successes[row] += weight
-            return
-        self.failures[row] += weight
-        land(self.landing[row], self.weight[row], landing, weight)

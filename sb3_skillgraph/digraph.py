@@ -33,8 +33,7 @@ def as_digraph(events: list[Event], walk_ids: list[str], edges: Edges) -> "netwo
     columns = {name: getattr(edges, name).tolist() for name in SHOWN}
     for row, (source, target) in enumerate(zip(edges.source.tolist(), edges.target.tolist(), strict=True)):
         graph.add_edge(events[source].id, walk_ids[target], **{name: values[row] for name, values in columns.items()})
-    runs = np.zeros(len(events))
-    np.add.at(runs, edges.target, edges.successes + edges.failures)
+    runs = np.bincount(edges.target, edges.successes + edges.failures, len(events))
     for (target, end), weight in _landed(edges).items():
         graph.add_edge(walk_ids[target], events[end].id, rate=weight / runs[target])
     return graph

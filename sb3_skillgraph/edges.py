@@ -11,7 +11,7 @@ MAX_LANDINGS = 4
 _INDICES = ("source", "target")
 #: What runs write into a record: it ages.
 RECORD = ("successes", "success_steps", "failures", "failure_steps")
-_NUMBERS = ("forward", "backward", "crossing_steps", *RECORD, "updated")
+NUMBERS = ("forward", "backward", "crossing_steps", *RECORD, "updated")
 
 
 class _Column:
@@ -61,7 +61,7 @@ class Edges:
             **{name: np.zeros(64, dtype=np.int64) for name in _INDICES},
             "landing": np.full((64, MAX_LANDINGS), NOWHERE, dtype=np.int64),
             "landing_weight": np.zeros((64, MAX_LANDINGS)),
-            **{name: np.zeros(64) for name in _NUMBERS},
+            **{name: np.zeros(64) for name in NUMBERS},
         }
         self._rows: dict[tuple[int, int], int] = {}
         self.let_go: set[tuple[int, int]] = set()  # pairs that a trajectory went between, of which a row was not kept
@@ -83,7 +83,7 @@ class Edges:
         row = self.size
         if row == len(self._arrays["source"]):
             for name, array in self._arrays.items():
-                self._arrays[name] = np.concatenate([array, np.zeros_like(array)])
+                self._arrays[name] = np.concatenate([array, np.zeros((max(row, 64), *array.shape[1:]), array.dtype)])
         for array in self._arrays.values():
             array[row] = 0
         self._arrays["landing"][row] = NOWHERE
@@ -117,8 +117,6 @@ class Edges:
         """Restore what :meth:`get_state` returned."""
         self.size = len(state["source"])
         self._arrays = {name: np.array(state[name]) for name in self._arrays}
-        if self.size == 0:
-            self._arrays = Edges()._arrays
         self._rows = self._by_pair()
         self.let_go = {(source, target) for source, target in state["let_go"].tolist()}
 

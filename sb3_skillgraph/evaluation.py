@@ -14,7 +14,6 @@ from tqdm import tqdm
 
 from sb3_skillgraph.agent import SkillGraphAgent
 from sb3_skillgraph.calibration import CalibrationBin, calibration
-from sb3_skillgraph.calibration import brier_score as brier_score
 from sb3_skillgraph.envs import MazeGeometry, find
 from sb3_skillgraph.envs.metrics import metric_of
 from sb3_skillgraph.envs.wrappers import time_limit
@@ -220,35 +219,38 @@ def run_pair(
     :return: what became of it
     """
     with _planning_for(agent, env):
-        return _run_pair(agent, env, start, goal, cells)
-
-
-def _run_pair(
-    agent: PolicyPredictor, env: gym.Env, start: np.ndarray | None, goal: np.ndarray | None, cells: float
-) -> PairResult:
-    has_reached = judge(agent, env)
-    observation, info = env.reset(options=None if goal is None else {"start": start, "goal": goal})
-    start = np.array(observation["achieved_goal"]) if start is None else start
-    goal = np.array(observation["desired_goal"]) if goal is None else goal
-    watch = _Watch(agent, observation) if isinstance(agent, SkillGraphAgent) else None
-    act = agent.predict if watch is None else watch.predict
-    state: tuple[np.ndarray, ...] | None = None
-    episode_start = np.ones(1, dtype=bool)
-    steps, nearest = 0, _distance(observation)
-    stuck, success = False, has_reached(observation, info, begins=True)
-    over = success
-    while not over:
-        action, state = act(observation, state=state, episode_start=episode_start, deterministic=True)
-        episode_start = np.zeros(1, dtype=bool)
-        observation, _, terminated, truncated, info = env.step(action)
-        steps += 1
-        nearest = min(nearest, _distance(observation))
-        stuck, success = bool(info.get("stuck")), has_reached(observation, info)
-        over = success or terminated or truncated or stuck
-    status, trace = None, None
-    if watch is not None:
-        status, trace = watch.plan.status, watch.ended(success and steps > 0)
-    return PairResult(start, goal, cells, success, steps, status, trace, nearest, stuck)
+        has_reached = judge(agent, env)
+        observation, info = env.reset(options=None if goal is None else {"start": start, "goal": goal})
+        start = np.array(observation["achieved_goal"]) if start is None else start
+        goal = np.array(observation["desired_goal"]) if goal is None else goal
+        plan = agent.plan(observation) if isinstance(agent, SkillGraphAgent) else None
+        trace = None if plan is None else SkillTrace(plan.success_probability, plan.expected_steps)
+        state: tuple[np.ndarray, ...] | None = None
+        episode_start = np.ones(1, dtype=bool)
+        steps, nearest = 0, _distance(observation)
+        stuck, success = False, has_reached(observation, info, begins=True)
+        over = success
+        while not over:
+            if isinstance(agent, SkillGraphAgent) and trace is not None:
+                # As predict does, with an eye on its options
+                action, state, runs = agent.act(observation, state)
+                trace.n_runs += len(runs)
+                trace.n_successes += sum(run.success for run in runs)
+                trace.direct_steps += int(state.option[0] == DIRECT)
+            else:
+                action, state = agent.predict(observation, state, episode_start, deterministic=True)
+            episode_start = np.zeros(1, dtype=bool)
+            observation, _, terminated, truncated, info = env.step(action)
+            steps += 1
+            nearest = min(nearest, _distance(observation))
+            stuck, success = bool(info.get("stuck")), has_reached(observation, info)
+            over = success or terminated or truncated or stuck
+        if trace is not None and success and steps > 0:
+            # The run that has reached the goal, with which the episode ended
+            trace.n_runs += 1
+            trace.n_successes += 1
+        status = None if plan is None else plan.status
+        return PairResult(start, goal, cells, success, steps, status, trace, nearest, stuck)
 
 
 def _learns_in(agent: SkillGraphAgent, env: gym.Env) -> bool:
@@ -298,27 +300,3 @@ def judge(agent: PolicyPredictor, env: gym.Env) -> Callable[..., bool]:
 
 def _distance(observation: Any) -> float:
     return float(np.linalg.norm(observation["achieved_goal"] - observation["desired_goal"]))
-
-
-class _Watch:
-    """Does what an agent's ``predict`` does, with an eye on its options."""
-
-    def __init__(self, agent: SkillGraphAgent, observation: Any) -> None:
-        self.agent = agent
-        self.plan = agent.plan(observation)
-        self.trace = SkillTrace(self.plan.success_probability, self.plan.expected_steps)
-
-    def predict(
-        self, observation: Any, state: tuple[np.ndarray, ...] | None = None, **kwargs: Any
-    ) -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
-        action, new_state, runs = self.agent.act(observation, state)
-        self.trace.n_runs += len(runs)
-        self.trace.n_successes += sum(run.success for run in runs)
-        self.trace.direct_steps += new_state.option[0] == DIRECT
-        return action, tuple(new_state)
-
-    def ended(self, success: bool) -> SkillTrace:
-        """Count the run that has reached the goal, with which the episode ended."""
-        self.trace.n_runs += success
-        self.trace.n_successes += success
-        return self.trace

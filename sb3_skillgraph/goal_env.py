@@ -36,14 +36,13 @@ class GoalSpec(NamedTuple):
                 f"SkillGraphAgent needs a goal environment ({wanted}), not {observation_space}. Where observations are a Box, "
                 "sb3_skillgraph.envs.PursueGoals makes one."
             )
-        boxes = [observation_space[key] for key in KEYS]
         others = [key for key, entry in observation_space.spaces.items() if not isinstance(entry, spaces.Box)]
         if others:
             raise ValueError(
                 f"SkillGraphAgent needs {wanted}, and Boxes only; {others} are none in {observation_space}. Where goals are "
                 "Dicts, sb3_skillgraph.envs.FlattenGoals makes vectors of them."
             )
-        shapes = [box.shape for box in boxes]
+        shapes = [observation_space[key].shape for key in KEYS]
         if shapes[1] != shapes[2] or shapes[1] is None or len(shapes[1]) != 1 or shapes[1][0] == 0:
             raise ValueError(
                 "'achieved_goal' and 'desired_goal' must be vectors of the same length, at least 1, not of shapes "
@@ -127,23 +126,6 @@ def as_goal(goal: Any, goal_dim: int) -> np.ndarray:
     if array.shape != (goal_dim,) or not np.isfinite(array).all():
         raise ValueError(f"A goal must be a finite vector of shape ({goal_dim},), not {goal!r}.")
     return array
-
-
-def with_terminal(new_obs: dict[str, np.ndarray], dones: np.ndarray, infos: list[dict[str, Any]]) -> dict[str, np.ndarray]:
-    """Put the observations that ended episodes back in place of those that began the next ones.
-
-    :param new_obs: what the VecEnv returned
-    :param dones: which episodes ended, shape ``(n_envs,)``
-    :param infos: the VecEnv's infos
-    :return: the observations that the last step led to
-    """
-    if not dones.any():
-        return new_obs
-    reached = {key: np.array(value) for key, value in new_obs.items()}
-    for i in np.flatnonzero(dones):
-        for key in reached:
-            reached[key][i] = infos[i]["terminal_observation"][key]
-    return reached
 
 
 def check_finite(observation: dict[str, np.ndarray], step: int) -> None:

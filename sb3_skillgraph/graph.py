@@ -45,28 +45,23 @@ class SkillGraph:
         self.cover_radius = SPACING * self.metric.radius
         self.events: list[Event] = []
         self.edges = Edges()
-        self._now = 0.0
-        self.version = 0  # rises with every change
+        self.now = 0.0  # updates of the walker so far: the clock by which records age
+        self._n_changes = 0
         self.centers = np.zeros((0, goal_dim))  # of the events
         self.visits: np.ndarray = np.zeros(0)  # of each event
         self.barren: np.ndarray = np.zeros(0)  # explorations from each event, since one found something
         self.walk_ids: list[str] = []  # of the walks to the events, in their order
         self._index: dict[str, int] = {}  # of events, by their ids and by those of the walks to them
         self.n_made = 0  # events so far, those that were merged included
-        self._nx: tuple[int, networkx.DiGraph] | None = None
+        self._nx: tuple[Any, networkx.DiGraph] | None = None
 
     def __repr__(self) -> str:
         return f"<SkillGraph of {len(self.events)} events and {self.edges.size} edges>"
 
     @property
-    def now(self) -> float:
-        """Updates of the walker so far: the clock by which records age."""
-        return self._now
-
-    @now.setter
-    def now(self, now: float) -> None:
-        self._now = now
-        self.version += 1
+    def version(self) -> tuple[int, float]:
+        """Rises with every change, and as time goes on."""
+        return self._n_changes, self.now
 
     # -- events -------------------------------------------------------------------------------------------------------
 
@@ -109,7 +104,7 @@ class SkillGraph:
         self.visits, self.barren = np.append(self.visits, 0.0), np.append(self.barren, 0.0)
         self._index[event.id] = self._index[self.walk_ids[i]] = i
         self.n_made += 1
-        self.version += 1
+        self._n_changes += 1
         return i
 
     def coarsen(self) -> np.ndarray:
@@ -150,7 +145,7 @@ class SkillGraph:
                 self._pour(old_edges, row, source, target, new_index)
         let_go = ((int(new_index[source]), int(new_index[target])) for source, target in old_edges.let_go)
         self.edges.let_go = {(source, target) for source, target in let_go if source != target}
-        self.version += 1
+        self._n_changes += 1
 
     def _build_index(self) -> dict[str, int]:
         by_event = {event.id: i for i, event in enumerate(self.events)}
@@ -169,7 +164,8 @@ class SkillGraph:
             getattr(edges, name)[new] += weight * getattr(old, name)[row]
         for landing, share in zip(old.landing[row].tolist(), old.landing_weight[row].tolist(), strict=True):
             if share > 0.0:
-                self._land(new, int(new_index[landing]) if landing != NOWHERE else NOWHERE, weight * share)
+                landed = int(new_index[landing]) if landing != NOWHERE else NOWHERE
+                land(edges.landing[new], edges.landing_weight[new], landed, weight * share)
 
     # -- what trajectories and runs teach -----------------------------------------------------------------------------
 
@@ -191,7 +187,7 @@ class SkillGraph:
         if edges.forward[back] == 0:
             edges.crossing_steps[back] = edges.crossing_steps[there]
         edges.backward[back] += 1
-        self.version += 1
+        self._n_changes += 1
 
     def explored(self, event: str, found: bool) -> None:
         """An exploration has begun in an event, or has found something.
@@ -219,8 +215,8 @@ class SkillGraph:
         else:
             edges.failures[row] += 1.0
             edges.failure_steps[row] += steps
-            self._land(row, landing, 1.0)
-        self.version += 1
+            land(edges.landing[row], edges.landing_weight[row], landing, 1.0)
+        self._n_changes += 1
 
     def _current_row(self, source: int, target: int) -> int:
         """Return the row of an edge, its weights as of now."""
@@ -238,9 +234,6 @@ class SkillGraph:
         """Return by how much the weights of each edge have aged since they were updated, shape ``(n_edges,)``."""
         return self._aging(self.edges.updated)
 
-    def _land(self, row: int, landing: int, weight: float) -> None:
-        land(self.edges.landing[row], self.edges.landing_weight[row], landing, weight)
-
     def bound_degree(self, worth: np.ndarray) -> None:
         """Let go of the edges of each event that are worth least, where it has too many.
 
@@ -253,7 +246,7 @@ class SkillGraph:
         rank = np.arange(len(order)) - first
         if (rank >= MAX_DEGREE).any():
             self.edges.keep(np.sort(order[rank < MAX_DEGREE]))
-            self.version += 1
+            self._n_changes += 1
 
     # -- looking at it ------------------------------------------------------------------------------------------------
 
@@ -305,13 +298,11 @@ class SkillGraph:
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Restore what :meth:`get_state` returned."""
-        self.events, self.walk_ids, self.edges = [], [], Edges()
-        self.centers = np.zeros((0, self.goal_dim))
-        for spec in state["events"]:
-            self.events[self.add_event(spec["center"], salient=spec["salient"])] = Event(**spec, metric=self.metric)
+        self.events = [Event(**spec, metric=self.metric) for spec in state["events"]]
+        self.centers = np.reshape([event.center for event in self.events], (-1, self.goal_dim))
         self.walk_ids = list(state["walks"])
         self._index = self._build_index()
         self.visits, self.barren = np.array(state["visits"]), np.array(state["barren"])
         self.edges.set_state(state["edges"])
         self.cover_radius, self.now, self.n_made = state["cover_radius"], state["now"], state["n_made"]
-        self.version += 1
+        self._n_changes += 1

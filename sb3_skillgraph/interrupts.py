@@ -50,5 +50,4 @@ class Interrupts:
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
         self._holding = False
-        if self._received is not None:
-            self._deliver()
+        self._deliver()

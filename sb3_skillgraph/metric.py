@@ -69,10 +69,6 @@ class Metric(ABC):
         :raises ValueError: if the metric is none of goals of that length
         """
 
-    @abstractmethod
-    def get_state(self) -> Any:
-        """Return what :func:`as_metric` makes the metric of, as plain data."""
-
 
 @dataclass(frozen=True)
 class Ball(Metric):
@@ -105,10 +101,6 @@ class Ball(Metric):
     def reach(self, goal_dim: int) -> np.ndarray:
         """Return the radius, for all dimensions."""
         return np.full(goal_dim, self.radius)
-
-    def get_state(self) -> float:
-        """Return the radius."""
-        return self.radius
 
 
 class Product(Metric):
@@ -148,10 +140,6 @@ class Product(Metric):
         last = max(i for part in self.parts for i in part.dims)
         if last >= goal_dim:
             raise ValueError(f"event_radius speaks of dimension {last} (counted from 0) of goals that have {goal_dim}.")
-
-    def get_state(self) -> Any:
-        """Return the parts."""
-        return {"parts": [{"kind": type(part).__name__, **vars(part)} for part in self.parts]}
 
     def __repr__(self) -> str:
         return f"Product({', '.join(map(repr, self.parts))})"
@@ -246,10 +234,6 @@ class Custom(Metric):
         if not (np.isfinite(away) & (away >= 0.0)).all():
             raise ValueError(f"event_radius={self!r} must return finite distances, 0 or more, and returned {away.tolist()}.")
 
-    def get_state(self) -> Any:
-        """Return the function."""
-        return self.function
-
 
 #: A user's own distance, in radii.
 MetricFunction = Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -296,6 +280,10 @@ def as_saved(metric: Metric) -> Any:
 
     :param metric: of one of these classes, or of a user's own
     """
-    parts = metric.parts if isinstance(metric, Product) else ()
-    ours = type(metric) in (Ball, Product, Custom) and all(type(part) in _PARTS.values() for part in parts)
-    return metric.get_state() if ours else metric
+    if type(metric) is Ball:
+        return metric.radius
+    if type(metric) is Custom:
+        return metric.function
+    if type(metric) is Product and all(type(part) in _PARTS.values() for part in metric.parts):
+        return {"parts": [{"kind": type(part).__name__, **vars(part)} for part in metric.parts]}
+    return metric

@@ -6,7 +6,7 @@ import numpy as np
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_skillgraph.arguments import HORIZON, box, find_salience, goal_metric, option_class, option_kwargs
+from sb3_skillgraph.arguments import HORIZON, find_salience, goal_metric, option_class, option_kwargs
 from sb3_skillgraph.checking import array
 from sb3_skillgraph.goal_env import GoalSpec, find_view
 from sb3_skillgraph.graph import SkillGraph
@@ -18,7 +18,6 @@ from sb3_skillgraph.memory.store import TransitionStore
 from sb3_skillgraph.options.average import AveragedPolicy
 from sb3_skillgraph.options.factory import OptionFactory
 from sb3_skillgraph.options.option import Option
-from sb3_skillgraph.options.parameters import set_skill_state, skill_state
 from sb3_skillgraph.options.views import ScaledView
 from sb3_skillgraph.options.walk import Walk, Walks
 from sb3_skillgraph.plan import Plan, describe
@@ -42,12 +41,7 @@ class Parts:
     #: Further arguments of the options' replay buffers.
     replay_kwargs: ClassVar[dict[str, Any]] = {}
 
-    graph: SkillGraph
-    model: WalkModel
-    planner: Planner
-    runner: Runner
     missions: Agenda
-    witness: Witness
     skills: Any  # :class:`Skills`; with ``**PAPER`` the options of its chains
 
     def __init__(self, agent: OffPolicyAlgorithm, spec: GoalSpec, arguments: dict[str, Any]) -> None:
@@ -61,8 +55,7 @@ class Parts:
             option_kwargs(agent, arguments),
             self.store,
             self.view,
-            box(agent.action_space),
-            self.metric,
+            agent.action_space,  # type: ignore[arg-type]  # a box
             arguments["goal_tolerance"],
             self.rng,
             {"hindsight": arguments["hindsight"], "horizon": HINDSIGHT_STEPS, **self.replay_kwargs},
@@ -117,18 +110,14 @@ class Parts:
 
         :param n_updates: how many there are to be, if an option has run all the time
         """
-        return [(self.walker, n_updates), *self._having_run(n_updates)]
-
-    def _having_run(self, n_updates: int) -> list[tuple[Option, int]]:
-        """Return the skills that have run since there was training."""
         rollout, skills = self.rollout, self.runner.skills
         earned = [(skills[id], round(n_updates * n / rollout.n_steps)) for id, n in rollout.ran.items() if id in skills]
         rollout.ran, rollout.n_steps = {}, 0
-        return earned
+        return [(self.walker, n_updates), *earned]
 
     def get_state(self) -> dict[str, Any]:
         """Return what has been learned beside the walker's networks, as plain data."""
-        skills = [skill_state(skill) for skill in self.skills.values()]
+        skills = [skill.get_state() for skill in self.skills.values()]
         average, model = self.average.get_state(), self.model.get_state()
         return {"graph": self.graph.get_state(), "model": model, "average": average, "skills": skills}
 
@@ -138,7 +127,7 @@ class Parts:
         self.model.set_state(state["model"])
         self.average.set_state(state["average"])
         for spec in state["skills"]:
-            set_skill_state(self.skills.make(spec["record"]["id"]), spec, self.factory.device)
+            self.skills.make(spec["record"]["id"]).set_state(spec)
 
     def get_experience(self) -> dict[str, Any]:
         """Return what goes with the replay buffer, as plain data: the transitions, and which of them are which skill's own."""

@@ -18,18 +18,16 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_skillgraph import generators
 from sb3_skillgraph.goal_env import describe_space, make_space, refuse_changed_goals
 from sb3_skillgraph.metric import Metric, as_saved
-from sb3_skillgraph.options.learner import OptionDDPG, OptionLearner, OptionTD3
+from sb3_skillgraph.options.learner import OptionDDPG, OptionTD3
 from sb3_skillgraph.options.parameters import set_parameters
 from sb3_skillgraph.rules import PaperRules
-from sb3_skillgraph.saving import MissingCallable, PathOrFile, check_encoding, known_class, load_tree
-from sb3_skillgraph.schema import check_header, check_learned, check_parameters, finite
+from sb3_skillgraph.saving import MissingCallable, PathOrFile, check_encoding, known_classes, load_tree
+from sb3_skillgraph.schema import COUNTERS, check_header, check_learned, check_parameters, finite
 
-for _option_class in (OptionDDPG, OptionTD3):
-    known_class(_option_class)
+known_classes(OptionDDPG, OptionTD3)
 
 #: What building and filling an agent raises if it is given something else than was saved.
 UNFIT = (AssertionError, AttributeError, IndexError, KeyError, MemoryError, OverflowError, RuntimeError, TypeError)
-_COUNTERS = ("num_timesteps", "_total_timesteps", "_num_timesteps_at_start", "_episode_num", "_n_updates")
 
 
 class Loaded(NamedTuple):
@@ -55,16 +53,12 @@ def agent_tree(agent: Any, left_out: Iterable[str]) -> dict[str, Any]:
         "spaces": {"observation": describe_space(agent.observation_space), "action": describe_space(agent.action_space)},
         "n_envs": agent.n_envs,
         "walker": parts.walker.learner._n_updates,
-        "update_path": _update_path(parts.walker.learner),
+        "update_path": getattr(parts.walker.learner, "update_path", "reference"),
         "horizon": parts.planner.horizon,
         "parameters": agent.get_parameters(),
         **parts.get_state(),
         "progress": _progress(agent),
     }
-
-
-def _update_path(learner: OffPolicyAlgorithm) -> str:
-    return learner.update_path if isinstance(learner, OptionLearner) else "reference"
 
 
 def _arguments(agent: Any) -> dict[str, Any]:
@@ -88,7 +82,7 @@ def _progress(agent: Any) -> dict[str, Any]:
     rollout, salience = agent.parts.rollout, agent.parts.missions.salience
     pending = rollout.pending
     return {
-        "counters": {name: getattr(agent, name) for name in _COUNTERS},
+        "counters": {name: getattr(agent, name) for name in COUNTERS},
         "current_progress_remaining": agent._current_progress_remaining,
         "ep_info_buffer": [episode for info in agent.ep_info_buffer or () for episode in _measured(info)],
         "ep_success_buffer": [bool(success) for success in agent.ep_success_buffer or ()],
@@ -223,7 +217,7 @@ def _restore(agent: Any, tree: dict[str, Any], same_envs: bool) -> None:
     if not parts.rollout.is_told_limit:
         parts.planner.horizon = tree["horizon"]
     progress = tree["progress"]
-    for name in _COUNTERS:
+    for name in COUNTERS:
         setattr(agent, name, progress["counters"][name])
     agent._current_progress_remaining = progress["current_progress_remaining"]
     agent.ep_info_buffer = deque(progress["ep_info_buffer"], maxlen=agent._stats_window_size)
@@ -250,7 +244,7 @@ def restore_env(agent: Any) -> bool:
     snapshot, agent._env_snapshot = agent._env_snapshot, None
     loaded, agent._loaded = agent._loaded, None
     if loaded is not None:
-        path = _update_path(agent.parts.walker.learner)
+        path = getattr(agent.parts.walker.learner, "update_path", "reference")
         if path != loaded.update_path:
             warnings.warn(
                 f"The walker was trained by the {loaded.update_path} update and goes on with the {path} update: their numbers "

@@ -1,6 +1,6 @@
 """Plans: the way to a goal that costs the fewest environment steps, by what options have done (sections 3.2.4, 3.3)."""
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -60,12 +60,9 @@ class Linear(NamedTuple):
         """
         from scipy.sparse import csr_array  # when it is used: it takes a while to import
 
-        success = choices.success(stance)
-        failure = 1.0 - success
-        landing, share = choices.landings()
-        steps = success * choices.steps + failure * choices.failed_steps
-        probability = np.concatenate([success[:, None], failure[:, None] * share], axis=1)
-        ends = np.concatenate([choices.target[:, None], landing], axis=1)
+        ends, probability = choices.outcomes(stance)
+        success = probability[:, 0]
+        steps = success * choices.steps + (1.0 - success) * choices.failed_steps
         stays = ends == choices.source[:, None]
         goes = np.maximum(1.0 - (probability * stays).sum(axis=1), 1e-9)
         probability[stays] = 0.0
@@ -158,7 +155,7 @@ class Planner:
         self.graph = graph
         self.choice_model = ChoiceModel(graph, model)
         self.horizon = horizon
-        self._known: dict[float, tuple[tuple[int, int], Linear]] = {}
+        self._known: dict[float, tuple[tuple[Any, int], Linear]] = {}
 
     @property
     def lost(self) -> float:
@@ -239,10 +236,7 @@ class Planner:
             if target == solution.goal:
                 return [*steps, (target, target)]
             # Of the places where the option ends, the likeliest that is nearer to the goal
-            landing, share = row.landings()
-            success = row.success(EXPECTED)
-            ends = np.append(landing[0], target)
-            weight = np.append((1.0 - success) * share[0], success)
+            ends, weight = (np.roll(column[0], -1) for column in row.outcomes(EXPECTED))  # of equals the target last
             weight[(values[ends] >= value) | (ends == NOWHERE) | (ends == solution.start)] = 0.0
             # An option that runs may be the best no more: then it is where it leads that counts.
             vertex = int(ends[weight.argmax()]) if weight.any() else target
@@ -281,8 +275,8 @@ class Planner:
     @staticmethod
     def _met(policy: Choices, start: int) -> np.ndarray:
         """Return the rows of a policy that are met from a start on, however unlikely."""
-        landing, share = policy.landings()
-        ends = np.concatenate([policy.target[:, None], np.where(share > 0.0, landing, NOWHERE)], axis=1)
+        ends, probability = policy.outcomes(EXPECTED)
+        ends[probability == 0.0] = NOWHERE
         met = policy.source == start
         while True:
             more = met | np.isin(policy.source, ends[met])
@@ -295,6 +289,9 @@ class Planner:
     ) -> np.ndarray:
         """Return the probability to have arrived at the goal from the start, within each number of time bins.
 
+        To have arrived from a vertex within t bins is to end a run from there, in one of its ends, and to arrive from that
+        within the bins that are left: the sum over the ends of their probability times ``arrived[t - delay, end]``.
+
         :param policy: the choice at each vertex
         :param stance: an opinion of how well options do
         :param for_good: share of the failures of each that happen again and again, if it always fails
@@ -302,14 +299,12 @@ class Planner:
         :param remaining: environment steps of all bins together
         """
         width, n = remaining / TIME_BINS, len(solution.values)
-        landing, share = policy.landings()
-        success = policy.success(stance)
-        ends = np.concatenate([policy.target[:, None], landing], axis=1) % n
-        share = (1.0 - for_good * (1.0 - success))[:, None] * share  # the rest is lost
-        weight = np.concatenate([success[:, None], (1.0 - success)[:, None] * share], axis=1)
-        failed = np.repeat(policy.failed_steps[:, None], landing.shape[1], axis=1)
+        ends, weight = policy.outcomes(stance, for_good)
+        ends %= n  # who is lost is at the last vertex
         # A run takes one bin at least, and otherwise its steps: between two bins it counts for both in proportion.
-        delay = np.maximum(np.concatenate([policy.steps[:, None], failed], axis=1) / width, 1.0)
+        delay = np.repeat(policy.failed_steps[:, None], ends.shape[1], axis=1)
+        delay[:, 0] = policy.steps
+        delay = np.maximum(delay / width, 1.0)
         whole = np.floor(delay).astype(np.int64)
         part = delay - whole
         # arrived[t, v]: probability to be at the goal within t bins from v; nobody is before the first one.

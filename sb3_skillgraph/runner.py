@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 
@@ -32,13 +32,6 @@ class Chosen(NamedTuple):
     timeout: float
 
 
-class Rules(Protocol):
-    """What the paper does in place of the planner."""
-
-    def choose(self, state: RunnerState, i: int, point: np.ndarray, goal: np.ndarray, stance: float) -> Chosen:
-        """Choose an option as :meth:`Runner.choose` does."""
-
-
 #: Chooses an option, given the state, the environment, where the agent stands, the goal and the stance.
 Chooser = Callable[[RunnerState, int, np.ndarray, np.ndarray, float], Chosen]
 
@@ -63,7 +56,7 @@ class Runner:
     actor: NumpyActor
     view: View
     skills: Mapping[str, Option] = field(default_factory=dict)
-    rules: Rules | None = None
+    rules: Chooser | None = None
     second: NumpyActor | None = None
 
     # -- one step -----------------------------------------------------------------------------------------------------
@@ -199,7 +192,7 @@ class Runner:
         :param stance: what the plan counts on
         """
         if self.rules is not None:
-            return self.rules.choose(state, i, point, goal, stance)
+            return self.rules(state, i, point, goal, stance)
         start = self.start(state, i, point)
         solution = self.decide(state, i, start, goal, stance)
         return self.option_of(solution.episode, solution.first(), start, goal)

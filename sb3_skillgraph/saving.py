@@ -28,22 +28,21 @@ SCHEMA = 2
 MAX_BYTES = 16 * 2**30
 PathOrFile = str | pathlib.Path | io.BufferedIOBase | BinaryIO
 
+_NOISES = (noise.NormalActionNoise, noise.OrnsteinUhlenbeckActionNoise, noise.VectorizedActionNoise)
 _CLASSES: dict[str, type] = {
     cls.__name__: cls
     for cls in (
-        *(DDPG, TD3, SAC, noise.NormalActionNoise, noise.OrnsteinUhlenbeckActionNoise, noise.VectorizedActionNoise),
+        *(DDPG, TD3, SAC, *_NOISES),
         *(th.nn.ReLU, th.nn.LeakyReLU, th.nn.ELU, th.nn.GELU, th.nn.SiLU, th.nn.Tanh, th.nn.Sigmoid, th.nn.Softplus),
         *(np.float32, np.float64),
         *(th.optim.Adam, th.optim.AdamW, th.optim.SGD, th.optim.RMSprop),
     )
 }
-_NOISES = (noise.NormalActionNoise, noise.OrnsteinUhlenbeckActionNoise, noise.VectorizedActionNoise)
 
 
-def known_class(cls: type) -> type:
-    """Let a class of this library be stored by name (a decorator)."""
-    _CLASSES[cls.__name__] = cls
-    return cls
+def known_classes(*classes: type) -> None:
+    """Let classes of this library be stored by name."""
+    _CLASSES.update((cls.__name__, cls) for cls in classes)
 
 
 class MissingCallable:
@@ -220,16 +219,11 @@ def _read(archive: zipfile.ZipFile, kind: str) -> dict[str, Any]:
         raise ValueError("it holds no agent.json")
     _check_sizes(archive)
     document = json.loads(archive.read("agent.json"))
+    written = f"it was written by sb3_skillgraph {document['version']} in schema {document['schema']}"
     if document["schema"] > SCHEMA:
-        raise ValueError(
-            f"it was written by sb3_skillgraph {document['version']} in schema {document['schema']}, newer than the "
-            f"schema {SCHEMA} that this version ({__version__}) reads: upgrade sb3_skillgraph"
-        )
+        raise ValueError(f"{written}, newer than the schema {SCHEMA} that this version ({__version__}) reads: upgrade")
     if document["schema"] < SCHEMA:
-        raise ValueError(
-            f"it was written by sb3_skillgraph {document['version']} in schema {document['schema']}, and this version "
-            f"({__version__}) reads schema {SCHEMA} only: load it with that version, or train anew"
-        )
+        raise ValueError(f"{written}; this one ({__version__}) reads schema {SCHEMA} only: load it with that, or train anew")
     if document["kind"] != kind:
         raise ValueError(f"it holds a {document['kind']!r}, not a {kind!r}")
     arrays = {}

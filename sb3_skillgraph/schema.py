@@ -17,7 +17,6 @@ from sb3_skillgraph.checking import (
     Check,
     anything,
     array,
-    at_most,
     dict_of,
     each,
     entries,
@@ -28,12 +27,12 @@ from sb3_skillgraph.checking import (
     optimizer_state,
     optional,
     refuse,
-    some,
+    sized,
     state_dict,
     text,
     whole,
 )
-from sb3_skillgraph.edges import MAX_LANDINGS, NOWHERE
+from sb3_skillgraph.edges import MAX_LANDINGS, NOWHERE, NUMBERS
 from sb3_skillgraph.learning.growth import ENOUGH_RUNS, GESTATION
 from sb3_skillgraph.learning.witness import N_SAMPLES
 from sb3_skillgraph.running import RunnerState
@@ -43,6 +42,8 @@ from sb3_skillgraph.walk_model import N_FEATURES
 MOST_ENVS = 10_000
 #: Environment steps of the longest episode that is planned for.
 MOST_STEPS = 10_000_000
+#: SB3's counters, which are saved.
+COUNTERS = ("num_timesteps", "_total_timesteps", "_num_timesteps_at_start", "_episode_num", "_n_updates")
 
 
 def check_header(tree: dict[str, Any], cls: Any) -> None:
@@ -172,8 +173,7 @@ def _graph(n_events: int, goal_dim: int) -> Check:
             target=index,
             landing=array((None, MAX_LANDINGS), "i", NOWHERE, n_events - 1),
             landing_weight=array((None, MAX_LANDINGS), low=0.0),
-            **dict.fromkeys(("forward", "backward", "crossing_steps", "successes", "success_steps"), weights),
-            **dict.fromkeys(("failures", "failure_steps", "updated"), weights),
+            **dict.fromkeys(NUMBERS, weights),
             let_go=array((None, 2), "i", 0, n_events - 1),
         ),
         visits=array((n_events,), low=0.0),
@@ -218,10 +218,9 @@ def _model(n_matched: int) -> Check:
 
 
 def _progress(n_envs: int, spec: Any, n_events: int, n_matched: int, agent: Any, env: VecEnv | None) -> Check:
-    counters = ("num_timesteps", "_total_timesteps", "_num_timesteps_at_start", "_episode_num", "_n_updates")
     episode = entries(r=number(), l=number(), t=number())
     return entries(
-        counters=entries(**dict.fromkeys(counters, whole())),
+        counters=entries(**dict.fromkeys(COUNTERS, whole())),
         current_progress_remaining=number(-1e9, 1.0),
         ep_info_buffer=list_of(episode),
         ep_success_buffer=list_of(flag),
@@ -246,7 +245,7 @@ def _rollout(n_envs: int, spec: Any, n_events: int, n_matched: int) -> Check:
         clean=flag,
     )
     event, passed = whole(0, max(n_events - 1, 0)), each(whole(), number(0.0), kind=tuple)
-    stay = each(event, whole(), whole(), number(0.0), some(list_of(passed)))
+    stay = each(event, whole(), whole(), number(0.0), sized(list_of(passed), 1))
     return entries(
         runner=each(*(_like(name, column) for name, column in zip(fresh._fields, fresh, strict=True)), kind=tuple),
         held=array((n_envs, spec.action_dim), low=-1.0, high=1.0),
@@ -257,14 +256,14 @@ def _rollout(n_envs: int, spec: Any, n_events: int, n_matched: int) -> Check:
         longest=whole(),
         missions=entries(current=list_of(optional(mission), n_envs)),
         witness=entries(
-            samples=at_most(N_SAMPLES, array((None, 4 + n_matched), low=0.0)),
+            samples=sized(array((None, 4 + n_matched), low=0.0), 0, N_SAMPLES),
             n_samples=whole(),
             n_steps=whole(),
             stays=list_of(list_of(stay), n_envs),
             step=list_of(whole(), n_envs),
             began=array((n_envs, spec.goal_dim)),
             growth=entries(
-                runs=dict_of(at_most(GESTATION, list_of(flag))),
+                runs=dict_of(sized(list_of(flag), 0, GESTATION)),
                 suspects=list_of(text),
                 before=dict_of(whole(0, ENOUGH_RUNS)),
                 again=dict_of(number(0.0)),
@@ -304,7 +303,8 @@ def _state_of(env: VecEnv) -> Any:
 
 def _environments(n_envs: int, agent: Any, env: VecEnv | None) -> Check:
     """Check the states of environments: of the one that is given, if it can tell its own."""
-    shown = {name: _shown(n_envs, box) for name, box in agent.observation_space.spaces.items()}
+    spaces = agent.observation_space.spaces.items()
+    shown = {name: array((n_envs, *box.shape), box.dtype.kind) for name, box in spaces}
     own = _state_of(env) if env is not None and env.num_envs == n_envs else None
     if env is not None and own is not None:
         shapes = entries(**{name: _like_any(value) for name, value in own.items()}) if isinstance(own, dict) else anything
@@ -328,10 +328,6 @@ def _environments(n_envs: int, agent: Any, env: VecEnv | None) -> Check:
         entries(**checks, **({"monitor_rewards": rewards} if with_rewards else {}))(value, where)
 
     return check
-
-
-def _shown(n_envs: int, box: Any) -> Check:
-    return array((n_envs, *box.shape), box.dtype.kind)
 
 
 def _like_any(own: Any) -> Check:

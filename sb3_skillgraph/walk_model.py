@@ -153,10 +153,11 @@ class WalkModel:
         self.scale = np.sqrt(np.average((features - self.mean) ** 2, axis=0, weights=weight))
         self.scale = np.maximum(self.scale, LEAST_SCALE)
         # What is guessed first: the mean walk is one of a hardly trained policy, a hasty one hardly ever succeeds, nor one
-        # that changes what nobody has seen to change so.
-        guessed = np.tile(self.mean, (2 + self.n_matched, 1))
-        guessed[1, 0] = max(guessed[1, 0], np.log(2.0 * HASTY))
-        guessed[2:, N_FEATURES:][np.eye(self.n_matched, dtype=bool)] = 1.0
+        # that changes what nobody has seen to change so, for each of what has to match.
+        hasty, unheard_of = self.mean.copy(), np.tile(self.mean, (self.n_matched, 1))
+        hasty[0] = max(hasty[0], np.log(2.0 * HASTY))
+        unheard_of[:, N_FEATURES:] = np.where(np.eye(self.n_matched, dtype=bool), 1.0, unheard_of[:, N_FEATURES:])
+        guessed = np.concatenate([self.mean[None], hasty[None], unheard_of])
         guesses = np.array([FIRST_GUESS, HASTY_GUESS, *[CHANGE_GUESS] * self.n_matched])
         standardised = (np.concatenate([features, guessed]) - self.mean) / self.scale
         successes = np.concatenate([successes, GUESS_RUNS * guesses])

@@ -52,7 +52,6 @@ def make_factory(
         store,
         ScaledView(view, Ball(radius)),
         spaces.Box(-1.0, 1.0, (2,), np.float32),
-        Ball(radius),
         tolerance,
         np.random.default_rng(seed),
         {"hindsight": 0.8, "shared": 0.5, "horizon": 50} | replay_kwargs,

@@ -899,7 +899,7 @@ def test_interrupt_in_an_update(monkeypatch: pytest.MonkeyPatch) -> None:
     check_goes_on(agent, [env], False)
 
 
-@pytest.mark.parametrize("where", ["store.add", "witness.step", "runner.advance", "missions.observe", "rollout.begin_episode"])
+@pytest.mark.parametrize("where", ["store.add", "witness.step", "runner.advance", "missions.observe", "witness.begin"])
 def test_ctrl_c_while_a_step_is_being_stored(where: str, monkeypatch: pytest.MonkeyPatch) -> None:
     env = Recorder(gym.make(TOY, max_steps=60))
     agent = new_agent(env, learning_starts=1000)  # updates are no part of storing

@@ -26,6 +26,7 @@ from sb3_skillgraph.metric import (
     Tilt,
     Within,
     as_metric,
+    as_saved,
 )
 
 TOY = "SkillGraph/ToyMaze-v0"
@@ -80,7 +81,7 @@ def test_a_direction_is_reached_within_its_angle_whatever_its_length(angle: floa
     if abs(abs(off) - 0.3) > 1e-6:
         assert HEADING.reached(aside, heading(angle)) == (abs(off) < 0.3)
     np.testing.assert_allclose(HEADING.nearest_goal(aside), heading(angle + off), atol=1e-9)
-    assert as_metric(HEADING.get_state()).reached(aside, heading(angle + off))
+    assert as_metric(as_saved(HEADING)).reached(aside, heading(angle + off))
 
 
 @profile(60)

@@ -367,7 +367,7 @@ class Learning:
         self.rollout.observe(self.seen(), np.zeros(n, dtype=bool), np.full(n, done), np.full(n, stuck))
         if done:
             for i, point in enumerate(self.points):
-                self.rollout.begin_episode(i, point)
+                self.rollout.witness.begin(i, point)
 
 
 def test_every_step_is_stored_once_and_in_order() -> None:
@@ -451,7 +451,7 @@ def test_only_runs_without_noise_are_recorded() -> None:
         learning = Learning(1, (6.0, 1.0))
         for x in np.arange(0.0, 20.0, 0.5):  # somebody shows the way
             learning.rollout.witness.step(0, np.array([x, 0.0]))
-        learning.rollout.begin_episode(0, learning.points[0])
+        learning.rollout.witness.begin(0, learning.points[0])
         for _ in range(200):
             if learning.missions.current[0] is None:
                 learning.missions.current[0] = Mission(learning.graph.centers[learning.rng.integers(5)].copy(), clean=clean)

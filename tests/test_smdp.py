@@ -59,7 +59,7 @@ def made(id: str, target: str | None, termination: Event | None, **kwargs: Any) 
     option = make_option(id, target, termination, **kwargs)
     own = make_factory(TransitionStore(10, 2, 2, 2), radius=RADIUS).make(id, target, termination)
     option.learner, option.metric = own.learner, Ball(RADIUS)  # with a replay, whose view tells what it sees
-    option._actor = Towards()  # type: ignore[assignment]
+    option.actor = Towards()  # type: ignore[assignment]
     return option
 
 
@@ -171,7 +171,7 @@ def test_one_step_of_the_global_policy_where_actions_have_many_dimensions(option
             return np.tile([1.0, 0, 0, 0, 0, 0, 0, 0], (len(seen), 1))
 
     walker = make_option("global", None, None)
-    walker._actor = Eastward()  # type: ignore[assignment]
+    walker.actor = Eastward()  # type: ignore[assignment]
     env = OptionsEnv(Legs(gym.make(TOY)), [], global_option=walker, max_options=8)
     assert len(env.primitives) == 1
     env.reset(options={"start": [-1.0, 1.0]})

@@ -102,7 +102,7 @@ class CoveringOptions:
             policy_kwargs={"net_arch": [128, 128]},
         )
         self._factory = OptionFactory(
-            option_class, kwargs, self.store, view, env.action_space, metric, 1.0, self.rng, {}, th.device("cpu"), shaping
+            option_class, kwargs, self.store, view, env.action_space, 1.0, self.rng, {}, th.device("cpu"), shaping
         )
         self.global_option = self._factory.make("global", None, None) if spec.action_dim > MOST_AXES else None
         self.env = OptionsEnv(

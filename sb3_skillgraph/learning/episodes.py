@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.vec_env import VecEnv
 
 #: What an environment may tell in ``info`` where it ends an episode, by the names in use.
 EXPLAINED = ("stuck", "success", "is_success")
@@ -39,36 +40,36 @@ class Episodes:
 
     def start_over(
         self, new_obs: dict[str, np.ndarray], dones: np.ndarray, stuck: np.ndarray, infos: list[dict[str, Any]]
-    ) -> dict[str, np.ndarray]:
+    ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
         """Give up the episodes of agents that are stuck, and begin all where they are to begin while adapting.
 
         :param new_obs: what the VecEnv returned
         :param dones: which episodes have ended; those given up are added in place, since SB3 counts by this array
         :param stuck: which agents can do nothing any more
         :param infos: the VecEnv's infos; those of episodes given up gain what SB3 looks for at an episode's end
-        :return: the observations that go on from here
+        :return: the observations that go on from here, and those that the step led to: the last ones of episodes that ended
         """
         env = self.agent.env
         assert env is not None
         given_up = stuck & ~dones
-        resets = given_up | dones if self.reset_options else given_up  # the VecEnv's own resets know no options
-        if not resets.any():
-            return new_obs
-        ended, new_obs = new_obs, {key: np.array(value) for key, value in new_obs.items()}
-        for i in np.flatnonzero(resets).tolist():
-            if given_up[i]:
-                infos[i]["terminal_observation"] = {key: value[i] for key, value in ended.items()}
-                self._count(i, infos[i])
-            observation, _ = env.env_method("reset", options=self.reset_options or None, indices=i)[0]
-            for key in new_obs:
-                new_obs[key][i] = observation[key]
         dones |= given_up
-        return new_obs
+        if not dones.any():
+            return new_obs, new_obs
+        reached, new_obs = ({key: np.array(value) for key, value in new_obs.items()} for _ in range(2))
+        for i in np.flatnonzero(dones).tolist():
+            if given_up[i]:
+                infos[i]["terminal_observation"] = {key: value[i] for key, value in reached.items()}
+                self._count(env, i, infos[i])
+            for key in reached:
+                reached[key][i] = infos[i]["terminal_observation"][key]
+            if given_up[i] or self.reset_options:  # the VecEnv's own resets know no options
+                observation, _ = env.env_method("reset", options=self.reset_options or None, indices=i)[0]
+                for key in new_obs:
+                    new_obs[key][i] = observation[key]
+        return new_obs, reached
 
-    def _count(self, i: int, info: dict[str, Any]) -> None:
+    def _count(self, env: VecEnv, i: int, info: dict[str, Any]) -> None:
         """Let SB3's statistics know of an episode that is given up: its Monitor counts only those that end."""
-        env = self.agent.env
-        assert env is not None
         if env.env_is_wrapped(Monitor, indices=i)[0]:
             rewards = env.get_attr("rewards", indices=i)[0]
             seconds = time.time() - env.get_attr("t_start", indices=i)[0]

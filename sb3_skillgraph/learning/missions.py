@@ -116,16 +116,11 @@ class Agenda(ABC):
     def _random_walk(self, point: np.ndarray) -> Mission:
         return Mission(point.astype(np.float64), explore_steps=self.exploration_steps, exploring=True)
 
-    def _is_at(self, point: np.ndarray, goal: np.ndarray) -> bool:
-        """Tell whether who stands at a point has reached a goal."""
-        return self.graph.metric.reached(point, goal)
-
     # -- saving -------------------------------------------------------------------------------------------------------
 
     def get_state(self) -> dict[str, Any]:
         """Return the missions as plain data."""
-        current = [None if mission is None else asdict(mission) for mission in self.current]
-        return {"current": current}
+        return {"current": [None if mission is None else asdict(mission) for mission in self.current]}
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Restore what :meth:`get_state` returned."""
@@ -161,7 +156,8 @@ class Missions(Agenda):
         if run is not None and mission.exploring and mission.beyond is not None:
             # Whether it has arrived or stands before a wall, from here it goes on towards another point
             proposal = self.salience.propose(self.rng)
-            mission.beyond = None if proposal is None else self._past(point, proposal)
+            beyond = self.graph.metric.beyond
+            mission.beyond = None if proposal is None else beyond(point, proposal, self.explore_beyond)
         elif run is not None:
             # Failed runs on the way are counted: who cannot get there does something else
             mission.n_failures += not run.success
@@ -182,7 +178,7 @@ class Missions(Agenda):
         if mission.exploring:
             mission.explore_steps -= 1
             return mission.explore_steps <= 0
-        arrived = self._is_at(point, mission.goal)
+        arrived = self.graph.metric.reached(point, mission.goal)
         if not arrived and mission.n_failures >= MAX_FAILURES:
             # Who cannot travel yet explores where it is: standing before a wall teaches nothing.
             mission.beyond, mission.explore_steps, arrived = None, self.exploration_steps, True
@@ -243,15 +239,12 @@ class Missions(Agenda):
         goal, begins_in = self.graph.centers[event].copy(), self.graph.id(event)
         if chance >= np.interp(len(self.graph.events), (FEW_EVENTS, MANY_EVENTS), (LEAST_TOWARDS, MOST_TOWARDS)):
             return Mission(goal, self.exploration_steps, None, begins_in)
-        return Mission(goal, self.exploration_steps, self._past(goal, point), begins_in)
-
-    def _past(self, begin: np.ndarray, point: np.ndarray) -> np.ndarray:
-        """Return where an exploration that begins somewhere goes for a proposed point: as far past it as is wanted."""
-        return self.graph.metric.beyond(begin, point, self.explore_beyond)
+        beyond = self.graph.metric.beyond(goal, point, self.explore_beyond)
+        return Mission(goal, self.exploration_steps, beyond, begins_in)
 
     def _adapt(self, point: np.ndarray, goal: np.ndarray) -> Mission:
         """Pursue the goal that adaptation is for; look for a way to it while nobody has been there (section 3.3)."""
-        if self._is_at(point, goal):
+        if self.graph.metric.reached(point, goal):
             return self._travel()  # to come back from somewhere else
         if self.graph.locate(goal) == NOWHERE and self.rng.random() < LOOK_FOR_A_WAY:
             return self._look_for(goal)

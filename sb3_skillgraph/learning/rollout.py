@@ -69,7 +69,7 @@ class Rollout:
         """
         self._forget()
         for env, point in enumerate(points):
-            self.begin_episode(env, point)
+            self.witness.begin(env, point)
 
     def _forget(self) -> None:
         """Forget what the environments were in the middle of."""
@@ -82,14 +82,6 @@ class Rollout:
         self.store.cut()
         self.witness.cut(n_envs)
         self.missions.cut(n_envs)
-
-    def begin_episode(self, env: int, point: np.ndarray) -> None:
-        """An episode begins.
-
-        :param env: in which environment
-        :param point: where, shape ``(goal_dim,)``
-        """
-        self.witness.begin(env, point)
 
     # -- acting -------------------------------------------------------------------------------------------------------
 

@@ -116,7 +116,9 @@ class Witness:
         if self._n_steps >= FIT_EVERY:
             self._n_steps = 0
             self.fit()
-            self._bound_degree()
+            # Of the walks that are likely to succeed the long ones are kept: they make ways short
+            success = self.choice_model.walks().success(EXPECTED)
+            self.graph.bound_degree(success * (1.0 + self.choice_model.kinds().distance))
         return is_new
 
     def _pass(self, env: int, point: np.ndarray) -> bool:
@@ -148,11 +150,6 @@ class Witness:
                 seen.add(stay.event)  # only the last time it was passed: a detour is no way
                 self.graph.crossed(stay.event, last.event, max(last.reached - stay.left, 1))
         self._stays[env] = [*recent, last]
-
-    def _bound_degree(self) -> None:
-        """Keep the walks that are likely to succeed, and of those the long ones: they make ways short."""
-        success = self.choice_model.walks().success(EXPECTED)
-        self.graph.bound_degree(success * (1.0 + self.choice_model.kinds().distance))
 
     def add_event(self, point: np.ndarray, *, salient: bool) -> int:
         """Add an event to the graph, which coarsens its cover where it is full.
@@ -224,7 +221,9 @@ class Witness:
             np.concatenate([edges.failures * aging, 1.0 - success]),
             np.concatenate([edges.success_steps * aging, success * steps]),
         )
-        model.fit_failures(self._far_share(kinds), *self._time_of_failures())
+        # The steps that failed runs took, beside those that they might have taken
+        taken, allowed = edges.failure_steps * aging, edges.failures * timeout(self.choice_model.walks().steps) * aging
+        model.fit_failures(self._far_share(kinds), float(taken.sum()), float(allowed.sum()))
 
     def _far_share(self, kinds: Kind) -> np.ndarray:
         """Return which share of failures lands far away, for hasty walks and for others."""
@@ -233,12 +232,6 @@ class Witness:
         failures, far = graph.edges.failures * graph.aging(), self.choice_model.far_failures(kinds)
         kinds_of_walks = ((hasty, HASTY_LOSS), (~hasty, 0.0))
         return np.array([(far[i].sum() + FAR_PRIOR * guess) / (failures[i].sum() + FAR_PRIOR) for i, guess in kinds_of_walks])
-
-    def _time_of_failures(self) -> tuple[float, float]:
-        """Return the steps that failed runs took, and those that they might have taken."""
-        edges, aging = self.graph.edges, self.graph.aging()
-        allowed = edges.failures * timeout(self.choice_model.walks().steps)
-        return float((edges.failure_steps * aging).sum()), float((allowed * aging).sum())
 
     # -- saving -------------------------------------------------------------------------------------------------------
 

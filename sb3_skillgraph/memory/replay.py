@@ -134,14 +134,9 @@ class OptionReplay(ReplayBuffer):
         self._rows = np.zeros(256, dtype=np.int64)
         self._n_rows = 0
 
-    @property
-    def _owns_all(self) -> bool:
-        """Whether all rows of the store count as the option's own: of one that is given its goal."""
-        return self.rule.termination is None
-
     def size(self) -> int:
         """Return how many transitions of its own the option can learn from."""
-        return len(self.store) if self._owns_all else len(self._readable())
+        return len(self.store) if self.rule.termination is None else len(self._readable())
 
     def add_rows(self, rows: np.ndarray) -> None:
         """Remember rows on which the option ran.
@@ -177,7 +172,7 @@ class OptionReplay(ReplayBuffer):
         :param batch_size: number of transitions
         """
         rng, store = self.rng, self.store
-        if self._owns_all:
+        if self.rule.termination is None:  # an option that is given its goal learns from everything
             n_own = batch_size
             rows = rng.integers(store.oldest, store.total, size=batch_size)
             imagined = rng.random(batch_size) < self.hindsight

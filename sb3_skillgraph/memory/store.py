@@ -27,7 +27,7 @@ class TransitionStore:
     def __init__(self, capacity: int, observation_dim: int, goal_dim: int, action_dim: int, n_envs: int = 1) -> None:
         self.capacity = max(capacity // n_envs, 1) * n_envs
         self.n_envs = n_envs
-        self.observation_dim, self.action_dim = observation_dim, action_dim
+        self.observation_dim, self.goal_dim, self.action_dim = observation_dim, goal_dim, action_dim
         self.total = 0
         ends = np.cumsum([observation_dim, goal_dim, observation_dim, goal_dim, action_dim, goal_dim]).tolist()
         self._slices = {name: slice(start, end) for name, start, end in zip(_COLUMNS, [0, *ends], ends, strict=False)}

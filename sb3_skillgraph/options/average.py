@@ -26,17 +26,13 @@ class AveragedPolicy:
 
     def __init__(self, learner: OffPolicyAlgorithm) -> None:
         self.learner = learner
+        assert isinstance(learner.policy.actor, BasePolicy)
+        self._now = learner.policy.actor
         self._mean: BasePolicy = copy.deepcopy(self._now)
         self.actor = NumpyActor(self._mean)
         # Found once: looking through the modules takes longer than the mean.
         self._parameters: tuple[list[th.Tensor], list[th.Tensor]] = [*self._now.parameters()], [*self._mean.parameters()]
         self._buffers = list(self._now.buffers()), list(self._mean.buffers())  # counts, running means
-
-    @property
-    def _now(self) -> BasePolicy:
-        actor = self.learner.policy.actor
-        assert isinstance(actor, BasePolicy)
-        return actor
 
     def follow(self, n_updates: int) -> None:
         """Take in what was learned.

@@ -15,7 +15,6 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from sb3_skillgraph.events import TerminationSet
 from sb3_skillgraph.memory.replay import OptionReplay, OptionRule
 from sb3_skillgraph.memory.store import TransitionStore
-from sb3_skillgraph.metric import Metric
 from sb3_skillgraph.options.option import Option
 from sb3_skillgraph.options.parameters import parameters, set_parameters
 from sb3_skillgraph.options.views import ScaledView
@@ -30,7 +29,6 @@ class OptionFactory:
     :param store: the shared memory of transitions
     :param view: what a policy sees
     :param action_space: action space of the environment
-    :param metric: of goal space
     :param tolerance: distance within which the global option's goals and those put in by hindsight are reached
     :param rng: random generator
     :param replay_kwargs: ``hindsight``, ``shared`` and ``horizon`` of :class:`OptionReplay`
@@ -43,7 +41,6 @@ class OptionFactory:
     store: TransitionStore
     view: ScaledView
     action_space: spaces.Box
-    metric: Metric
     tolerance: float
     rng: np.random.Generator
     replay_kwargs: dict[str, Any]
@@ -53,8 +50,7 @@ class OptionFactory:
     def __post_init__(self) -> None:
         self._low = self.action_space.low.ravel()
         self._half = 0.5 * (self.action_space.high.ravel() - self._low)
-        dims = (self.store.column(name, np.arange(0)).shape[1] for name in ("observation", "goal"))
-        dim = self.view.dim(*dims)
+        dim = self.view.dim(self.store.observation_dim, self.store.goal_dim)
         self.observation_space = spaces.Box(-np.inf, np.inf, (dim,), np.float32)
 
     def unscale(self, scaled: np.ndarray) -> np.ndarray:
@@ -69,7 +65,7 @@ class OptionFactory:
         :param termination: the set it ends in; None for the global option
         :return: the option, gestating
         """
-        rule = OptionRule(self.metric, self.tolerance, self.option_kwargs.get("gamma", 0.99), self.shaping, termination)
+        rule = OptionRule(self.view.metric, self.tolerance, self.option_kwargs.get("gamma", 0.99), self.shaping, termination)
         replay = OptionReplay(
             self.store,
             self.view,
@@ -80,7 +76,7 @@ class OptionFactory:
             device=self.device,
             **self.replay_kwargs,
         )
-        option = Option(id, target, termination, self._learner(replay), self.metric)
+        option = Option(id, target, termination, self._learner(replay), self.view.metric)
         if termination is not None:
             replay.aim = partial(getattr, option, "subgoal")  # and not a lambda: of a deep copy it is the copy's
         return option

@@ -44,15 +44,15 @@ class NumpyActor:
         if [parameter.data_ptr() for parameter in self._parameters] != self._addresses:
             self._view()
         if not self._layers:
-            return self._act_by_torch(observations)
+            with th.no_grad():
+                actions = self.actor._predict(th.as_tensor(observations, device=self.actor.device), deterministic=True)
+            return actions.cpu().numpy()
         values = observations.reshape(len(observations), -1).astype(np.float32, copy=False)
-        for weight, bias in self._layers[:-1]:
+        for i, (weight, bias) in enumerate(self._layers):
+            if i > 0:
+                np.maximum(values, 0, out=values)
             values = np.dot(values, weight)
             values += bias
-            np.maximum(values, 0, out=values)
-        weight, bias = self._layers[-1]
-        values = np.dot(values, weight)
-        values += bias
         return np.tanh(values, out=values)
 
     def __reduce__(self) -> tuple[type["NumpyActor"], tuple[BasePolicy]]:
@@ -65,11 +65,6 @@ class NumpyActor:
         self._layers = [
             (linear.weight.detach().numpy().T, linear.bias.detach().numpy()) for linear in plain_linears(self.actor)
         ]
-
-    def _act_by_torch(self, observations: np.ndarray) -> np.ndarray:
-        with th.no_grad():
-            actions = self.actor._predict(th.as_tensor(observations, device=self.actor.device), deterministic=True)
-        return actions.cpu().numpy()
 
 
 def is_vector_space(space: spaces.Space) -> bool:

@@ -2,6 +2,7 @@
 
 from collections import deque
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -13,9 +14,11 @@ from sb3_skillgraph.memory.replay import OptionReplay
 from sb3_skillgraph.metric import Metric
 from sb3_skillgraph.options.initiation import InitiationSet
 from sb3_skillgraph.options.numpy_actor import NumpyActor
+from sb3_skillgraph.options.parameters import parameters, set_parameters
 
 #: States kept of those in which successful runs ended.
 EFFECTS_LENGTH = 200
+_COUNTS = ("mature", "n_successes", "n_runs", "n_steps")
 
 
 @dataclass(eq=False, repr=False)
@@ -48,7 +51,6 @@ class Option:
         self.n_runs = 0
         self.n_steps = 0  # of all runs together
         self.effects: deque[np.ndarray] = deque(maxlen=EFFECTS_LENGTH)
-        self._actor: NumpyActor | None = None
 
     def __repr__(self) -> str:
         age = "" if self.mature else ", gestating"
@@ -61,14 +63,12 @@ class Option:
         assert isinstance(replay, OptionReplay)
         return replay
 
-    @property
+    @cached_property
     def actor(self) -> NumpyActor:
         """The policy, for roll-outs."""
-        if self._actor is None:
-            actor = self.learner.policy.actor
-            assert isinstance(actor, BasePolicy)
-            self._actor = NumpyActor(actor)
-        return self._actor
+        actor = self.learner.policy.actor
+        assert isinstance(actor, BasePolicy)
+        return NumpyActor(actor)
 
     def contains(self, points: np.ndarray) -> np.ndarray:
         """Tell which points an option may aim at that leads here: this option's pessimistic initiation set.
@@ -136,23 +136,21 @@ class Option:
             self.initiation.add_failure(start)
 
     def get_state(self) -> dict[str, Any]:
-        """Return all but the learner's networks as plain data."""
-        return {
-            "id": self.id,
-            "target": self.target,
-            "mature": self.mature,
-            "n_successes": self.n_successes,
-            "n_runs": self.n_runs,
-            "n_steps": self.n_steps,
+        """Return everything, the networks too, as plain data."""
+        record = {
+            **{name: getattr(self, name) for name in ("id", "target", *_COUNTS)},
             "effects": list(self.effects),
             "initiation": self.initiation.get_state(),
             "n_updates": self.learner._n_updates,
         }
+        return {"record": record, "parameters": parameters(self.learner)}
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Restore what :meth:`get_state` returned."""
-        self.mature = state["mature"]
-        self.n_successes, self.n_runs, self.n_steps = state["n_successes"], state["n_runs"], state["n_steps"]
-        self.effects = deque(state["effects"], maxlen=EFFECTS_LENGTH)
-        self.initiation.set_state(state["initiation"])
-        self.learner._n_updates = state["n_updates"]
+        record = state["record"]
+        for name in _COUNTS:
+            setattr(self, name, record[name])
+        self.effects = deque(record["effects"], maxlen=EFFECTS_LENGTH)
+        self.initiation.set_state(record["initiation"])
+        self.learner._n_updates = record["n_updates"]
+        set_parameters(self.learner, state["parameters"], True, self.learner.device)

@@ -5,8 +5,6 @@ from typing import Any
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.save_util import recursive_getattr
 
-from sb3_skillgraph.options.option import Option
-
 
 def parameters(learner: OffPolicyAlgorithm) -> dict[str, Any]:
     """Return a model's state dicts by SB3's names, and under ``"variables"`` its tensors that belong to no network.
@@ -30,22 +28,3 @@ def set_parameters(learner: OffPolicyAlgorithm, given: dict[str, Any], exact_mat
     for name, tensor in given.pop("variables", {}).items():
         recursive_getattr(learner, name).data.copy_(tensor)
     learner.set_parameters(given, exact_match, device)
-
-
-def skill_state(skill: Option) -> dict[str, Any]:
-    """Return an option with a network of its own as plain data.
-
-    :param skill: the option
-    """
-    return {"record": skill.get_state(), "parameters": parameters(skill.learner)}
-
-
-def set_skill_state(skill: Option, state: dict[str, Any], device: Any) -> None:
-    """Restore what :func:`skill_state` returned.
-
-    :param skill: a new option
-    :param state: the state
-    :param device: torch device
-    """
-    skill.set_state(state["record"])
-    set_parameters(skill.learner, state["parameters"], True, device)

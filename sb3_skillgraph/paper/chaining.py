@@ -124,11 +124,6 @@ class DeepSkillChaining:
         """Return the chains as plain data; options are saved by their owner."""
         return {"chains": [asdict(chain) for chain in self.chains]}
 
-    def set_state(self, state: dict[str, Any], options: list[Option]) -> None:
-        """Restore what :meth:`get_state` returned.
-
-        :param state: the state
-        :param options: the restored options
-        """
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Restore what :meth:`get_state` returned."""
         self.chains = [SkillChain(**spec) for spec in state["chains"]]
-        self.options.update((option.id, option) for option in options)

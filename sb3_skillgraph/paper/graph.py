@@ -68,7 +68,7 @@ class PaperGraph(SkillGraph):
         self.triggers[event.id] = deque([event.center], maxlen=TRIGGERS_LENGTH)
         for option in self.options.values():
             self._event_option_edge(event.id, option)
-            self._option_event_edge(option, event)
+            self._option_edge(option, event)
         return i
 
     def add_option(self, option: Option) -> None:
@@ -77,7 +77,7 @@ class PaperGraph(SkillGraph):
         :param option: the option; its edges come with :meth:`refresh`
         """
         self.options[option.id] = option
-        self.version += 1
+        self._n_changes += 1
         self._digraph.add_node(option.id, kind="option", target=option.target)
 
     # -- edges --------------------------------------------------------------------------------------------------------
@@ -99,30 +99,24 @@ class PaperGraph(SkillGraph):
         for target in [*self._digraph.successors(option.id)]:
             self._digraph.remove_edge(option.id, target)
         for event in self.events:
-            self._option_event_edge(option, event)
+            self._option_edge(option, event)
         for other in self.options.values():
-            self._option_option_edge(option, other)
+            self._option_edge(option, other)
             if refitted:
-                self._option_option_edge(other, option)
+                self._option_edge(other, option)
         if refitted:
             for event in self.events:
                 self._event_option_edge(event.id, option)
-        self.version += 1
+        self._n_changes += 1
 
-    def _option_option_edge(self, first: Option, second: Option) -> None:
-        if self._digraph.has_edge(first.id, second.id):
-            self._digraph.remove_edge(first.id, second.id)
-        if first is not second and first.effects and second.initiation.optimistic(np.stack(first.effects)).all():
-            self._option_edge(first, second.id)
-
-    def _option_event_edge(self, option: Option, event: Event) -> None:
-        if option.effects and event.contains(np.stack(option.effects)).all():
-            self._option_edge(option, event.id)
-
-    def _option_edge(self, option: Option, target: str) -> None:
+    def _option_edge(self, option: Option, target: Event | Option) -> None:
+        """Join an option to an event or another option in which its effect set lies; part them where it does not."""
+        if self._digraph.has_edge(option.id, target.id):
+            self._digraph.remove_edge(option.id, target.id)
+        holds = target.contains if isinstance(target, Event) else target.initiation.optimistic
         rate = option.success_rate
-        if rate > 0.0:
-            self._digraph.add_edge(option.id, target, weight=1.0 / rate, success_rate=rate)
+        if option is not target and rate > 0.0 and option.effects and holds(np.stack(option.effects)).all():
+            self._digraph.add_edge(option.id, target.id, weight=1.0 / rate, success_rate=rate)
 
     def _event_option_edge(self, event: str, option: Option) -> None:
         startable = option.initiation.optimistic(np.stack(self.triggers[event])).all()

@@ -51,7 +51,7 @@ class PaperMissions(Agenda):
         mission = self.current[env]
         assert mission is not None
         mission.explore_steps -= mission.exploring
-        over = done or (mission.explore_steps <= 0 if mission.exploring else self._is_at(point, mission.goal))
+        over = done or (mission.explore_steps <= 0 if mission.exploring else self.graph.metric.reached(point, mission.goal))
         self.n_episodes += done
         if over:
             self.current[env] = None

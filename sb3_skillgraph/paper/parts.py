@@ -10,7 +10,6 @@ from sb3_skillgraph.edges import NOWHERE
 from sb3_skillgraph.goal_env import GoalSpec
 from sb3_skillgraph.metric import Ball
 from sb3_skillgraph.options.option import Option
-from sb3_skillgraph.options.parameters import set_skill_state, skill_state
 from sb3_skillgraph.paper.chaining import DeepSkillChaining
 from sb3_skillgraph.paper.graph import PaperGraph
 from sb3_skillgraph.paper.missions import PaperMissions
@@ -42,7 +41,7 @@ class PaperParts(Parts):
         self.graph, self.model, self.skills = graph, WalkModel(), self.chaining.options
         self.planner = Planner(graph, self.model, HORIZON)  # never asked: the rules choose
         self.policy = PaperPolicy(graph, self.chaining, rules.timeout, self.planner)
-        self.runner = Runner(graph, self.planner, self.walker.actor, self.view, self.skills, self.policy)
+        self.runner = Runner(graph, self.planner, self.walker.actor, self.view, self.skills, self.policy.choose)
         salience = find_salience(arguments, graph, self.store, agent, relearn=1)
         missions = PaperMissions(graph, self.chaining, salience, rules, arguments["exploration_steps"], self.rng)
         witness: Any = PaperWitness(graph, self.chaining, missions, agent.n_envs)
@@ -67,24 +66,23 @@ class PaperParts(Parts):
 
         :param n_updates: how many there are to be, if an option has run all the time
         """
-        return self._having_run(n_updates)
+        return super().learners(n_updates)[1:]  # the walker does not learn
 
     def get_state(self) -> dict[str, Any]:
         """Return what has been learned, the options' networks too, as plain data."""
-        options = [skill_state(option) for option in self.chaining.options.values()]
+        options = [option.get_state() for option in self.chaining.options.values()]
         return {"graph": self.graph.get_state(), "chaining": self.chaining.get_state(), "options": options}
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Restore what :meth:`get_state` returned."""
         graph: Any = self.graph
         graph.set_state(state["graph"])
-        options: dict[str, Option] = {}
+        options = self.chaining.options
         for spec in state["options"]:  # an option's parent was made before it
             record = spec["record"]
             event = graph.index(record["target"])
             termination = graph.events[event] if event != NOWHERE else options[record["target"]]
-            option = self.factory.make(record["id"], record["target"], termination)
-            set_skill_state(option, spec, self.factory.device)
-            options[option.id] = option
-        self.chaining.set_state(state["chaining"], list(options.values()))
+            options[record["id"]] = self.factory.make(record["id"], record["target"], termination)
+            options[record["id"]].set_state(spec)
+        self.chaining.set_state(state["chaining"])
         graph.set_options(state["graph"], options)

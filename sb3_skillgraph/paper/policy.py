@@ -1,7 +1,6 @@
 """Which option runs, by the paper: the planner's inside the graph, the policy over options outside (3.2.3, 3.2.4, A.6)."""
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 
@@ -12,17 +11,6 @@ from sb3_skillgraph.plan import Plan, Status, from_here, remaining_steps
 from sb3_skillgraph.planning import DIRECT, GOAL, TIME_BINS, Planner
 from sb3_skillgraph.runner import Chosen
 from sb3_skillgraph.running import RunnerState
-
-
-class Way(NamedTuple):
-    """A way through the graph.
-
-    :param vertices: ids, an option that can start first
-    :param at_goal: whether the goal is reached at the end; else that is the vertex nearest to it
-    """
-
-    vertices: list[str]
-    at_goal: bool
 
 
 class PaperPolicy:
@@ -46,10 +34,6 @@ class PaperPolicy:
         self.timeout = timeout
         self.planner = planner
 
-    @property
-    def _horizon(self) -> float:
-        return float(self.planner.horizon)
-
     def choose(self, state: RunnerState, i: int, point: np.ndarray, goal: np.ndarray, stance: float) -> Chosen:
         """Choose the option that runs next.
 
@@ -60,13 +44,13 @@ class PaperPolicy:
         :param stance: not used
         """
         way = self.way(state, i, point, goal)
-        option = self.outside(point, goal) if way is None else self.chaining.options[way.vertices[0]]
+        option = self.outside(point, goal) if way is None else self.chaining.options[way[0]]
         event = self._here(point, goal)
         if option is None:
             return Chosen(DIRECT, event, goal, self.timeout)
         return Chosen(option.id, event, option.subgoal, self.timeout)
 
-    def way(self, state: RunnerState, i: int, point: np.ndarray, goal: np.ndarray) -> Way | None:
+    def way(self, state: RunnerState, i: int, point: np.ndarray, goal: np.ndarray) -> list[str] | None:
         """Return the way that is planned: to the goal, else to the event nearest to it; None if there is none to go.
 
         Whoever has been at the nearest event and left it from there has left the graph.
@@ -83,7 +67,7 @@ class PaperPolicy:
         costs, ways = self.graph.ways_from(able)
         ends = [vertex for vertex in self._targets(goal) if vertex in costs]
         if ends:
-            return Way(ways[min(ends, key=lambda vertex: costs[vertex] + self._runs(vertex))], at_goal=True)
+            return [*ways[min(ends, key=lambda vertex: costs[vertex] + self._runs(vertex))], GOAL]
         here = self._here(point, goal)
         known = [event for event in self.graph.events if event.id in costs or event.id == here]
         if not known:
@@ -91,7 +75,7 @@ class PaperPolicy:
         nearest = min(known, key=lambda event: math.dist(event.center, goal)).id
         if nearest == here or nearest in state.run_event[i]:
             return None
-        return Way(ways[nearest], at_goal=False)
+        return ways[nearest]
 
     def _here(self, point: np.ndarray, goal: np.ndarray) -> str:
         """Return the event that holds a point, of several the one nearest to the goal; an empty string if there is none."""
@@ -132,13 +116,11 @@ class PaperPolicy:
         :param goal: shape ``(goal_dim,)``
         :return: the plan; its path is empty where the policy over options decides
         """
-        way, status = self.way(state, 0, point, goal), self._status(goal)
-        if way is None:
-            return PaperPlan(status, (), self._horizon, 0.0)
-        if not way.at_goal:
-            return PaperPlan(status, tuple(way.vertices), self._horizon, 0.0)
-        steps, probability = self.worth(way.vertices, remaining_steps(state, self.planner.horizon))
-        return PaperPlan(status, (*way.vertices, GOAL), from_here(state, steps), probability)
+        way, status = self.way(state, 0, point, goal) or [], self._status(goal)
+        if GOAL not in way:
+            return PaperPlan(status, tuple(way), self.planner.horizon, 0.0)
+        steps, probability = self.worth(way, remaining_steps(state, self.planner.horizon))
+        return PaperPlan(status, tuple(way), from_here(state, steps), probability)
 
     def worth(self, vertices: list[str], remaining: float) -> tuple[float, float]:
         """Tell what a way is worth, if a failed option is run again.
@@ -150,7 +132,7 @@ class PaperPolicy:
         """
         options = [self.chaining.options[vertex] for vertex in vertices if vertex in self.chaining.options]
         if not all(option.n_successes for option in options):
-            return self._horizon, 0.0
+            return self.planner.horizon, 0.0
         arrived = np.zeros(TIME_BINS + 1)  # by time bin, the probability to be done with the options so far
         arrived[0] = 1.0
         for option in options:
@@ -160,7 +142,7 @@ class PaperPolicy:
                 arrived[t + delay] += option.success_rate * begun[t]
                 begun[t + delay] += (1.0 - option.success_rate) * begun[t]
         steps = sum(option.n_steps / option.n_successes for option in options)
-        return min(steps, self._horizon), float(arrived.sum())
+        return min(steps, self.planner.horizon), float(arrived.sum())
 
     def links_from(self, event: str) -> list[tuple[str, str, float, float]]:
         """Return the ways from an event to others that pass no third one.
@@ -170,7 +152,7 @@ class PaperPolicy:
         """
         links = []
         for target, way in self.graph.ways_past_no_event(event).items():
-            steps, probability = self.worth(way, self._horizon)
+            steps, probability = self.worth(way, self.planner.horizon)
             links.append((event, target, probability, steps))
         return links
 

@@ -6,7 +6,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sb3_skillgraph.choices import Choices
-from sb3_skillgraph.options.execution import Fate, fate
 from sb3_skillgraph.options.option import Option
 from sb3_skillgraph.planning import DIRECT
 from sb3_skillgraph.runner import Chosen, Runner
@@ -87,12 +86,12 @@ class OptionActions:
         see = run.option.replay.view
         return run.option.actor.act(see(seen["observation"], seen["achieved_goal"], run.aim[None].astype(np.float32)))[0]
 
-    def fate(self, run: Running, observation: Observation, steps: int, stuck: bool = False) -> Fate:
-        """Tell whether it is where it leads, or at the goal."""
+    def outcome(self, run: Running, observation: Observation, steps: int, stuck: bool) -> bool | None:
+        """Tell whether it has come where it leads, or to the goal; None while it runs on."""
         point, option = np.asarray(observation["achieved_goal"]), run.option
         assert option is not None
         reached = option.metric.reached(point, run.aim) if option.target is None else option.terminates(point)
-        return fate(reached, steps, int(run.timeout), stuck)
+        return reached and not stuck if reached or stuck or steps >= run.timeout else None
 
     def primitive(self) -> None:
         """Nothing is remembered from step to step."""
@@ -110,7 +109,6 @@ class WalkActions:
 
     def __init__(self, runner: Runner) -> None:
         self.runner = runner
-        self.ids: list[str] = []
         self.state: Any = RunnerState.fresh(1, runner.graph.goal_dim, 0)
         self._action_of: dict[str, int] = {}
         self._chosen: Chosen | None = None
@@ -122,13 +120,9 @@ class WalkActions:
 
     def n(self) -> int:
         """Return how many walks there have been; new ones come last, those whose event is gone stay."""
-        ids = self.runner.graph.walk_ids
-        if ids and (len(self.ids) < len(ids) or ids[-1] not in self._action_of):
-            for id in ids:
-                if id not in self._action_of:
-                    self._action_of[id] = len(self.ids)
-                    self.ids.append(id)
-        return len(self.ids)
+        for id in self.runner.graph.walk_ids:
+            self._action_of.setdefault(id, len(self._action_of))
+        return len(self._action_of)
 
     def action_of(self, id: str) -> int | None:
         """Return a walk's action; None for the walk straight to the goal."""
@@ -150,7 +144,7 @@ class WalkActions:
         """Begin a walk, with the time that the agent would give it."""
         point, goal = (np.asarray(observation[key], dtype=np.float32) for key in ("achieved_goal", "desired_goal"))
         choices, graph = self.choices(observation), self.runner.graph
-        target = len(graph.events) if action is None else graph.index(self.ids[action])
+        target = len(graph.events) if action is None else graph.index([*self._action_of][action])
         row = int(np.flatnonzero(choices.target == target)[0])
         self._chosen = self.runner.option_of(choices, row, self.runner.start(self.state, 0, point), goal)
         return Running(self._chosen.option, None, None, self._chosen.aim, self._chosen.timeout)
@@ -162,15 +156,11 @@ class WalkActions:
         scaled, self.state = self.runner.act(batch_of_one(observation), goals, self.state, choose=lambda *_: chosen)
         return scaled[0]
 
-    def fate(self, run: Running, observation: Observation, steps: int, stuck: bool = False) -> Fate:
-        """Let the runner tell whether the walk has ended."""
+    def outcome(self, run: Running, observation: Observation, steps: int, stuck: bool) -> bool | None:
+        """Let the runner tell whether the walk has ended, and how."""
         points = np.asarray(observation["achieved_goal"], dtype=np.float32)[None]
         self.state, runs = self.runner.advance(self.state, points, [stuck])
-        if not runs:
-            return Fate.RUNNING
-        if stuck:
-            return Fate.STUCK
-        return Fate.SUCCEEDED if runs[0].success else Fate.TIMED_OUT
+        return runs[0].success if runs else None
 
     def primitive(self) -> None:
         """A step was taken: nothing runs, and the agent is where it finds itself."""

@@ -5,7 +5,6 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.type_aliases import PolicyPredictor
 
-from sb3_skillgraph.options.execution import Fate
 from sb3_skillgraph.smdp.actions import Running
 from sb3_skillgraph.smdp.options_env import MASK, OptionsEnv
 
@@ -46,7 +45,7 @@ class FlatPolicy:
             run, steps, memory, self.env.actions.state = state[0].item(), int(state[1][0]), state[2].item(), state[3].item()
         else:
             self.env.actions.reset(observation)
-        if run is not None and self.env.fate(run, observation, steps) != Fate.RUNNING:
+        if run is not None and self.env.outcome(run, observation, steps) is not None:
             run, steps = None, 0
         if run is None:
             seen = {**observation, MASK: self.env.masks_at(observation).astype(np.int8)}

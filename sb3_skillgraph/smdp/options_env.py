@@ -8,7 +8,6 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from sb3_skillgraph.options.execution import Fate
 from sb3_skillgraph.options.option import Option
 from sb3_skillgraph.options.walk import Walk, Walks
 from sb3_skillgraph.smdp.actions import OptionActions, Running, WalkActions
@@ -80,11 +79,14 @@ class OptionsEnv(gym.Wrapper):
         self.timeout = timeout
         self.actions = _actions(options, global_option, timeout)
         self.primitives = self._find_primitives(env.action_space, primitives)
+        # Always to be taken: the walk straight to the goal if there is one, and primitives
+        self.n_fixed = len(self.primitives) + self.actions.has_direct
         if max_options is None:
             max_options = N_OPTIONS
             if isinstance(self.actions, WalkActions):
                 max_options = 2 * self.actions.runner.graph.max_events + self.n_fixed
         self.max_options = max_options
+        self.first_fixed = max_options - self.n_fixed
         self.action_space = spaces.Discrete(max_options)
         self.observation_space = spaces.Dict({**inner.spaces, MASK: spaces.MultiBinary(max_options)})
         self._inner_space = env.action_space
@@ -117,16 +119,6 @@ class OptionsEnv(gym.Wrapper):
                 f"max_options={self.max_options}: give max_options={2 ** math.ceil(math.log2(needed))}."
             )
         return n_options
-
-    @property
-    def n_fixed(self) -> int:
-        """How many actions can always be taken: the walk straight to the goal if there is one, and primitives."""
-        return len(self.primitives) + self.actions.has_direct
-
-    @property
-    def first_fixed(self) -> int:
-        """The first of the actions that can always be taken."""
-        return self.max_options - self.n_fixed
 
     @property
     def global_action(self) -> int:
@@ -200,13 +192,14 @@ class OptionsEnv(gym.Wrapper):
             total += discount * float(reward)
             discount *= self.gamma
             tau += 1
-            what = self.fate(run, observation, tau, bool(info.get("stuck")))
-            if what == Fate.STUCK:
+            stuck = bool(info.get("stuck"))
+            success = self.outcome(run, observation, tau, stuck)
+            if stuck:
                 terminated = True
                 total += discount * min(float(reward), 0.0) / max(1.0 - self.gamma, 1e-3)
-            if what != Fate.RUNNING or terminated or truncated:
+            if success is not None or terminated or truncated:
                 break
-        info = {**info, "tau": tau, "discount": discount, "option": run.id, "option_success": what == Fate.SUCCEEDED}
+        info = {**info, "tau": tau, "discount": discount, "option": run.id, "option_success": bool(success)}
         return self._see(observation), total, terminated, truncated, info
 
     def begin(self, observation: dict[str, np.ndarray], action: int) -> Running:
@@ -236,8 +229,8 @@ class OptionsEnv(gym.Wrapper):
         low, high = self._inner_space.low, self._inner_space.high
         return (low + 0.5 * (scaled.reshape(low.shape) + 1.0) * (high - low)).astype(self._inner_space.dtype)
 
-    def fate(self, run: Running, observation: dict[str, np.ndarray], steps: int, stuck: bool = False) -> Fate:
-        """Tell whether a running option goes on.
+    def outcome(self, run: Running, observation: dict[str, np.ndarray], steps: int, stuck: bool = False) -> bool | None:
+        """Tell whether an option has succeeded; None while it goes on.
 
         :param run: what :meth:`begin` returned
         :param observation: of the wrapped environment, after the step
@@ -245,9 +238,9 @@ class OptionsEnv(gym.Wrapper):
         :param stuck: whether the agent can do nothing any more
         """
         if not run.single:
-            return self.actions.fate(run, observation, steps, stuck)
+            return self.actions.outcome(run, observation, steps, stuck)
         self.actions.primitive()
-        return Fate.STUCK if stuck else Fate.SUCCEEDED
+        return not stuck
 
     def _see(self, observation: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         self._last = observation

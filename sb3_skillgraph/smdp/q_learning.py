@@ -95,8 +95,8 @@ class MaskedMultiInputPolicy(MaskedPolicy):
         )
 
 
-class _Discounts(ReplayBuffer):
-    """Keeps, beside SB3's replay buffers, what a transition's successor is discounted by: ``info["discount"]``."""
+class SMDPReplayBuffer(ReplayBuffer):
+    """SB3's replay buffer that keeps, too, what a transition's successor is discounted by: ``info["discount"]``."""
 
     def __init__(self, *args: Any, gamma: float, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
@@ -104,6 +104,7 @@ class _Discounts(ReplayBuffer):
         self.discounts = np.full((self.buffer_size, self.n_envs), gamma, dtype=np.float32)
 
     def add(self, obs: Any, next_obs: Any, action: Any, reward: Any, done: Any, infos: list[dict[str, Any]]) -> None:
+        """Store a transition, as SB3 does, and its discount."""
         self.discounts[self.pos] = [info.get("discount", self.gamma) for info in infos]
         super().add(obs, next_obs, action, reward, done, infos)
 
@@ -120,11 +121,7 @@ class _Discounts(ReplayBuffer):
         return samples._replace(discounts=self.to_torch(self.discounts[batch_inds, env_inds].reshape(-1, 1)))
 
 
-class SMDPReplayBuffer(_Discounts):
-    """SB3's replay buffer with a discount for each transition."""
-
-
-class SMDPDictReplayBuffer(_Discounts, DictReplayBuffer):
+class SMDPDictReplayBuffer(SMDPReplayBuffer, DictReplayBuffer):
     """SB3's replay buffer for Dict observations with a discount for each transition."""
 
 
