@@ -74,8 +74,9 @@ class ReplaySearch:
         actions = parts.runner.actor.act(seen)
         with th.no_grad():
             critic = parts.walker.learner.critic
-            values = th.cat(critic(*(th.as_tensor(array, dtype=th.float32) for array in (seen, actions))), dim=1)
-        value = values.min(dim=1).values.numpy() - parts.factory.shaping * self.agent.metric.travel(whole[1], whole[2])
+            given = (th.as_tensor(array, dtype=th.float32, device=critic.device) for array in (seen, actions))
+            values = th.cat(critic(*given), dim=1)
+        value = values.min(dim=1).values.cpu().numpy() - parts.factory.shaping * self.agent.metric.travel(whole[1], whole[2])
         # A walk of n steps is paid -1 each: -(1 - gamma^n) / (1 - gamma).
         return np.asarray(np.log(np.clip(1.0 + (1.0 - gamma) * value, LEAST, 1.0)) / math.log(gamma))
 
