@@ -72,6 +72,7 @@ def test_pairs_are_free_and_far_apart() -> None:
 
 
 def test_a_trained_agent_gets_to_most_goals_a_random_walk_to_few(trained: SkillGraphAgent) -> None:
+    trained.learn(3000, reset_num_timesteps=False)
     kwargs: dict[str, Any] = dict(n_pairs=30, seed=1, env_kwargs=dict(max_steps=100))
     agents, chance = evaluate_pairs(trained, TOY, **kwargs), evaluate_pairs(RandomWalk(), TOY, **kwargs)
     assert agents.success_rate >= 0.7
