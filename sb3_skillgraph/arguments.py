@@ -10,7 +10,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import TrainFreq
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_skillgraph.checking import MOST, Check, anything, dict_of, number, one_of, optional, whole
+from sb3_skillgraph.checking import Check, anything, dict_of, number, one_of, optional, whole
 from sb3_skillgraph.envs.metrics import env_metric
 from sb3_skillgraph.goal_env import Oracle, env_attribute
 from sb3_skillgraph.graph import SkillGraph
@@ -45,9 +45,10 @@ def option_class(given: type[OffPolicyAlgorithm] | str) -> type[OffPolicyAlgorit
     raise ValueError(f"option_class is {given!r}: it must be an SB3 off-policy class, or one of {', '.join(OPTION_CLASSES)}.")
 
 
+ANY = 2**62  # more than anybody asks for
 #: What arguments may be that are numbers, or one of some values.
 _CHECKS: dict[str, Check] = {
-    "learning_rate": number(0, FASTEST),
+    "learning_rate": number(0, FASTEST, what="a schedule or a number"),
     "tau": number(0, 1),
     "gamma": number(0, 1),
     "action_noise": number(0, 1e6),
@@ -55,16 +56,16 @@ _CHECKS: dict[str, Check] = {
     "hindsight": number(0, 1),
     "goal_tolerance": number(1e-6, 1),
     "shaping": number(0, 1e6),
-    "learning_starts": whole(),
-    "buffer_size": whole(1),
-    "batch_size": whole(1),
+    "learning_starts": whole(0, ANY),
+    "buffer_size": whole(1, ANY),
+    "batch_size": whole(1, ANY),
     "gradient_steps": whole(-1, 100_000),  # a call of train must end
-    "stats_window_size": whole(1),
-    "max_events": whole(8),
-    "walk_steps": whole(1),
-    "exploration_steps": whole(1),
-    "seed": optional(whole(-MOST)),
-    "verbose": optional(whole(-MOST)),
+    "stats_window_size": whole(1, ANY),
+    "max_events": whole(8, ANY),
+    "walk_steps": whole(1, ANY),
+    "exploration_steps": whole(1, ANY),
+    "seed": optional(whole(-ANY, ANY)),
+    "verbose": optional(whole(-ANY, ANY)),
     "option_kwargs": optional(dict_of(anything)),
     "policy_kwargs": optional(dict_of(anything)),
     "skills": one_of("where_needed", "always", "never"),  # when walks get a network of their own

@@ -32,7 +32,7 @@ def refuse(where: str, wanted: str, value: Any) -> None:
 def number(low: float = -np.inf, high: float = np.inf, kinds: Any = int | float, what: str = "a number") -> Check:
     """Check a finite number in a range."""
     upper = " on" if high >= MOST else f" to {high:g}"
-    wanted = what if low <= -MOST else f"{what} from {low:g}{upper}"
+    wanted = what if low <= -MOST and high >= MOST else f"{what} from {low:g}{upper}"
 
     def check(value: Any, where: str) -> None:
         if not isinstance(value, kinds) or isinstance(value, bool) or not low <= value <= high or abs(value) == np.inf:
@@ -110,7 +110,7 @@ def sized(check: Check, least: int, most: int = MOST) -> Check:
     def check_length(value: Any, where: str) -> None:
         check(value, where)
         if not least <= len(value) <= most:
-            refuse(where, f"of {least} to {most} rows", value)
+            refuse(where, f"of {least} rows at least" if len(value) < least else f"of {most} rows at most", value)
 
     return check_length
 

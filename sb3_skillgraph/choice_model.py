@@ -161,8 +161,10 @@ class ChoiceModel:
         for event, target, success, landing, number in zip(*(column.tolist() for column in runs), strict=True):
             weight = EPISODE_WEIGHT * number
             for row in np.flatnonzero((events == event) & (choices.target == target)).tolist():
-                (choices.successes if success else choices.failures)[row] += weight
-                if not success:
+                if success:
+                    choices.successes[row] += weight
+                else:
+                    choices.failures[row] += weight
                     land(choices.landing[row], choices.weight[row], landing, weight)
 
     def _edges(self, chosen: np.ndarray, replaced: np.ndarray, tried: Choices) -> Choices:

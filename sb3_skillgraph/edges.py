@@ -11,6 +11,7 @@ MAX_LANDINGS = 4
 _INDICES = ("source", "target")
 #: What runs write into a record: it ages.
 RECORD = ("successes", "success_steps", "failures", "failure_steps")
+#: All columns that hold numbers.
 NUMBERS = ("forward", "backward", "crossing_steps", *RECORD, "updated")
 
 

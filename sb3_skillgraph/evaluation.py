@@ -238,7 +238,7 @@ def run_pair(
                 trace.n_successes += sum(run.success for run in runs)
                 trace.direct_steps += int(state.option[0] == DIRECT)
             else:
-                action, state = agent.predict(observation, state, episode_start, deterministic=True)
+                action, state = agent.predict(observation, state=state, episode_start=episode_start, deterministic=True)
             episode_start = np.zeros(1, dtype=bool)
             observation, _, terminated, truncated, info = env.step(action)
             steps += 1

@@ -244,7 +244,7 @@ def as_metric(given: Any) -> Metric:
     """Return the metric that is meant.
 
     :param given: a metric, or what one is made of: a radius; a radius for each dimension (infinite where it does not matter);
-        a function ``(a, b) -> distance`` in radii; or what ``get_state`` returned
+        a function ``(a, b) -> distance`` in radii; or what :func:`as_saved` returned
     :raises ValueError: if it is none of these
 
     >>> as_metric(0.45).reached(np.array([0.0, 0.0]), np.array([0.3, 0.3]))

@@ -219,11 +219,13 @@ def _read(archive: zipfile.ZipFile, kind: str) -> dict[str, Any]:
         raise ValueError("it holds no agent.json")
     _check_sizes(archive)
     document = json.loads(archive.read("agent.json"))
-    written = f"it was written by sb3_skillgraph {document['version']} in schema {document['schema']}"
+    written = f"it was written by sb3_skillgraph {document.get('version')} in schema {document['schema']}"
     if document["schema"] > SCHEMA:
-        raise ValueError(f"{written}, newer than the schema {SCHEMA} that this version ({__version__}) reads: upgrade")
+        raise ValueError(f"{written}, newer than the schema {SCHEMA} that sb3_skillgraph {__version__} reads: upgrade it")
     if document["schema"] < SCHEMA:
-        raise ValueError(f"{written}; this one ({__version__}) reads schema {SCHEMA} only: load it with that, or train anew")
+        raise ValueError(
+            f"{written}; this one ({__version__}) reads schema {SCHEMA} only: load it with that one, or train anew"
+        )
     if document["kind"] != kind:
         raise ValueError(f"it holds a {document['kind']!r}, not a {kind!r}")
     arrays = {}

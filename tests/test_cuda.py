@@ -1,4 +1,4 @@
-"""Agents on a GPU learn by torch's update, and are saved there and loaded on a CPU; skipped where there is none."""
+"""Agents on a GPU learn by torch's update, and are saved there and loaded on a CPU (tried where there is one)."""
 
 from pathlib import Path
 

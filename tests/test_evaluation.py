@@ -79,6 +79,19 @@ def test_a_trained_agent_gets_to_most_goals_a_random_walk_to_few(trained: SkillG
     assert chance.success_rate <= 0.3
 
 
+class Named:
+    """A predictor that takes what SB3's ``evaluate_policy`` hands it, by name."""
+
+    def predict(self, observation: Any, state: Any = None, **kwargs: Any) -> tuple[np.ndarray, Any]:
+        assert kwargs.keys() == {"episode_start", "deterministic"}
+        return np.zeros(2, dtype=np.float32), state
+
+
+def test_predictors_are_asked_by_name() -> None:
+    named: Any = Named()
+    assert evaluate_pairs(named, TOY, n_pairs=2, env_kwargs=dict(max_steps=5)).success_rate <= 1.0
+
+
 def test_traces_tell_how_the_options_did(trained: SkillGraphAgent) -> None:
     result = evaluate_pairs(trained, TOY, n_pairs=20, seed=1)
     assert len(result.traces) == len(result.promises) == 20

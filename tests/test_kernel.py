@@ -8,6 +8,7 @@ import pytest
 import torch as th
 from gymnasium import spaces
 from learners import by_torch, distance, fill, make, same, train
+from numba import njit
 from stable_baselines3.common.buffers import ReplayBuffer
 
 from sb3_skillgraph.options import blas, kernel
@@ -334,7 +335,7 @@ def test_a_moment_that_is_missing_is_named():
         train(model, 1)
 
 
-@compiled
+@njit  # and nothing kept on disk: it would be the product that was compiled with it
 def multiply(left, right, left_turned, right_turned):
     return kernel.product(left, right, left_turned, right_turned)
 

@@ -1,5 +1,6 @@
 """How episodes end and begin while learning: agents that are stuck, starts that are given."""
 
+import copy
 import functools
 import time
 import warnings
@@ -55,13 +56,15 @@ class Episodes:
         dones |= given_up
         if not dones.any():
             return new_obs, new_obs
-        reached, new_obs = ({key: np.array(value) for key, value in new_obs.items()} for _ in range(2))
+        reached = {key: np.array(value) for key, value in new_obs.items()}
+        new_obs = copy.deepcopy(reached)
         for i in np.flatnonzero(dones).tolist():
             if given_up[i]:
                 infos[i]["terminal_observation"] = {key: value[i] for key, value in reached.items()}
                 self._count(env, i, infos[i])
-            for key in reached:
-                reached[key][i] = infos[i]["terminal_observation"][key]
+            else:
+                for key in reached:
+                    reached[key][i] = infos[i]["terminal_observation"][key]
             if given_up[i] or self.reset_options:  # the VecEnv's own resets know no options
                 observation, _ = env.env_method("reset", options=self.reset_options or None, indices=i)[0]
                 for key in new_obs:

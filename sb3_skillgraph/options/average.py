@@ -49,7 +49,7 @@ class AveragedPolicy:
             mean_buffer.copy_(now_buffer)
 
     def restart(self) -> None:
-        """Begin with the actor as it is: it was replaced by another."""
+        """Begin with the actor as it is: its weights were set to others."""
         self._mean.load_state_dict(self._now.state_dict())
 
     def get_state(self) -> dict[str, np.ndarray]:

@@ -1,4 +1,4 @@
-"""The parameters of networks and optimisers as SB3 names them, and an option that has its own as plain data."""
+"""The parameters of networks and optimisers as SB3 names them."""
 
 from typing import Any
 

@@ -118,7 +118,7 @@ class PaperPolicy:
         """
         way, status = self.way(state, 0, point, goal) or [], self._status(goal)
         if GOAL not in way:
-            return PaperPlan(status, tuple(way), self.planner.horizon, 0.0)
+            return PaperPlan(status, tuple(way), float(self.planner.horizon), 0.0)
         steps, probability = self.worth(way, remaining_steps(state, self.planner.horizon))
         return PaperPlan(status, tuple(way), from_here(state, steps), probability)
 
@@ -132,7 +132,7 @@ class PaperPolicy:
         """
         options = [self.chaining.options[vertex] for vertex in vertices if vertex in self.chaining.options]
         if not all(option.n_successes for option in options):
-            return self.planner.horizon, 0.0
+            return float(self.planner.horizon), 0.0
         arrived = np.zeros(TIME_BINS + 1)  # by time bin, the probability to be done with the options so far
         arrived[0] = 1.0
         for option in options:
@@ -142,7 +142,7 @@ class PaperPolicy:
                 arrived[t + delay] += option.success_rate * begun[t]
                 begun[t + delay] += (1.0 - option.success_rate) * begun[t]
         steps = sum(option.n_steps / option.n_successes for option in options)
-        return min(steps, self.planner.horizon), float(arrived.sum())
+        return min(steps, float(self.planner.horizon)), float(arrived.sum())
 
     def links_from(self, event: str) -> list[tuple[str, str, float, float]]:
         """Return the ways from an event to others that pass no third one.

@@ -91,7 +91,9 @@ class OptionActions:
         point, option = np.asarray(observation["achieved_goal"]), run.option
         assert option is not None
         reached = option.metric.reached(point, run.aim) if option.target is None else option.terminates(point)
-        return reached and not stuck if reached or stuck or steps >= run.timeout else None
+        if reached or stuck or steps >= int(run.timeout):
+            return reached and not stuck
+        return None
 
     def primitive(self) -> None:
         """Nothing is remembered from step to step."""
@@ -110,6 +112,7 @@ class WalkActions:
     def __init__(self, runner: Runner) -> None:
         self.runner = runner
         self.state: Any = RunnerState.fresh(1, runner.graph.goal_dim, 0)
+        self.ids: list[str] = []
         self._action_of: dict[str, int] = {}
         self._chosen: Chosen | None = None
 
@@ -120,9 +123,11 @@ class WalkActions:
 
     def n(self) -> int:
         """Return how many walks there have been; new ones come last, those whose event is gone stay."""
-        for id in self.runner.graph.walk_ids:
-            self._action_of.setdefault(id, len(self._action_of))
-        return len(self._action_of)
+        ids = self.runner.graph.walk_ids
+        if ids and (len(self.ids) < len(ids) or ids[-1] not in self._action_of):
+            self.ids += [id for id in ids if id not in self._action_of]
+            self._action_of = {id: action for action, id in enumerate(self.ids)}
+        return len(self.ids)
 
     def action_of(self, id: str) -> int | None:
         """Return a walk's action; None for the walk straight to the goal."""
@@ -144,7 +149,7 @@ class WalkActions:
         """Begin a walk, with the time that the agent would give it."""
         point, goal = (np.asarray(observation[key], dtype=np.float32) for key in ("achieved_goal", "desired_goal"))
         choices, graph = self.choices(observation), self.runner.graph
-        target = len(graph.events) if action is None else graph.index([*self._action_of][action])
+        target = len(graph.events) if action is None else graph.index(self.ids[action])
         row = int(np.flatnonzero(choices.target == target)[0])
         self._chosen = self.runner.option_of(choices, row, self.runner.start(self.state, 0, point), goal)
         return Running(self._chosen.option, None, None, self._chosen.aim, self._chosen.timeout)
