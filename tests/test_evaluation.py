@@ -131,6 +131,7 @@ def test_watching_an_agent_changes_nothing_in_what_it_does(trained: SkillGraphAg
 
 def test_runs_are_counted_when_they_end(trained: SkillGraphAgent) -> None:
     """The trace of a pair is that of the runs which ``act`` tells of."""
+    trained.learn(3000, reset_num_timesteps=False)
     env = gym.make(TOY, terminate_on_success=True)
     start, goal = np.array([-1.0, 1.0]), np.array([-1.0, -1.0])
     pair = run_pair(trained, env, start, goal, 4.0)
