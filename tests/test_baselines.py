@@ -257,6 +257,7 @@ def test_a_search_goes_from_state_to_state_to_the_goal(trained: Any) -> None:
 
 
 def test_a_search_reaches_most_of_what_its_agent_does(trained: Any) -> None:
+    trained.learn(3000, reset_num_timesteps=False)
     search = ReplaySearch(trained, 300, seed=0)
     result = evaluate_pairs(search, TOY, n_pairs=20, seed=5)
     assert result.success_rate >= 0.7
