@@ -207,10 +207,13 @@ def rich(agent: SkillGraphAgent) -> bool:
 def trained_files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """An agent that finds its way in the maze, with a graph worth the name, and its replay buffer, as files."""
     folder = tmp_path_factory.mktemp("trained")
-    agent = new_agent().learn(2000, log_interval=None)
-    while not rich(agent):
-        assert agent.num_timesteps < 6000, agent.graph_summary()
-        agent.learn(100, log_interval=None, reset_num_timesteps=False)
+    for seed in range(5):  # whether a point that was proposed lies between landmarks is a matter of chance
+        agent = new_agent(seed=seed).learn(2000, log_interval=None)
+        while not rich(agent) and agent.num_timesteps < 4000:
+            agent.learn(100, log_interval=None, reset_num_timesteps=False)
+        if rich(agent):
+            break
+    assert rich(agent), agent.graph_summary()
     agent.save(folder / "agent.zip")
     agent.save_replay_buffer(folder / "replay.zip")
     return folder / "agent.zip", folder / "replay.zip"
