@@ -139,4 +139,4 @@ def test_plans_to_behind_the_door_go_by_the_key(trained: SkillGraphAgent) -> Non
     assert {(0.0, 0.0), (1.0, 0.0), (1.0, 1.0)} <= set(flags)
     with_key = next(center for center in path if center[2])
     assert np.linalg.norm(with_key[:2] - [-3.0, 2.0]) < 0.7
-    assert evaluate_pairs(trained, ID, n_pairs=30).success_rate >= 0.3  # straight on: 0.07 after five times as many steps
+    assert evaluate_pairs(trained, ID, n_pairs=30).success_rate >= 0.6
