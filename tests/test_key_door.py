@@ -117,7 +117,7 @@ def test_it_is_an_environment(env: PointKeyDoorEnv) -> None:
 @pytest.fixture(scope="module")
 def trained() -> SkillGraphAgent:
     agent = SkillGraphAgent("MultiInputPolicy", gym.make(ID), seed=0)
-    return agent.learn(20_000)
+    return agent.learn(30_000)
 
 
 def test_no_event_joins_places_with_and_without_the_key(trained: SkillGraphAgent) -> None:
