@@ -352,6 +352,12 @@ def test_products(left_turned, right_turned):
         np.testing.assert_allclose(result, left @ right, rtol=1e-4, atol=1e-5)
 
 
+def test_a_product_is_compiled_once_whatever_is_transposed():
+    train(make(OptionTD3, [16]), 2)
+    assert len(kernel.product.signatures) <= 1  # none where the update was found on disk
+    assert len(kernel.multiply.signatures) <= 1
+
+
 @pytest.mark.parametrize("whose", ["torch", "scipy"])
 def test_whoever_multiplies(whose, monkeypatch):
     def none_such(path):

@@ -1,11 +1,9 @@
 """BLAS's product of matrices, for compiled code to call: torch's own, where it can be found."""
 
 import ctypes
-from typing import Any
 
 import llvmlite.binding
 import torch as th
-from numba import types
 from numba.extending import get_cython_function_address
 
 
@@ -21,11 +19,5 @@ def find_sgemm() -> int:
     return address or get_cython_function_address("scipy.linalg.cython_blas", "sgemm")
 
 
-_TEXT, _WHOLE, _FLOAT = (types.CPointer(kind) for kind in (types.uint8, types.int64, types.float32))
-_NAME = "sb3_skillgraph_sgemm"  # by which compiled code on disk finds it again
-llvmlite.binding.add_symbol(_NAME, find_sgemm())
-# Whether to transpose; sizes; a factor; matrices with the lengths of their rows; another factor; the result, likewise
-sgemm: Any = types.ExternalFunction(
-    _NAME,
-    types.void(_TEXT, _TEXT, _WHOLE, _WHOLE, _WHOLE, _FLOAT, _FLOAT, _WHOLE, _FLOAT, _WHOLE, _FLOAT, _FLOAT, _WHOLE),
-)
+SGEMM = "sb3_skillgraph_sgemm"  # by which compiled code on disk finds it again
+llvmlite.binding.add_symbol(SGEMM, find_sgemm())

@@ -157,7 +157,7 @@ def _rates(optimizer: th.optim.Optimizer, tau: float) -> "kernel.Rates":
 
 def _places(
     name: str, network: nn.Module, target: nn.Module, optimizer: th.optim.Optimizer, sizes: tuple[int, int]
-) -> "kernel.Places":
+) -> "kernel.Learner":
     """Return where a network, its target and its moments are, if all of it is as the numbers in and out ask."""
     shapes = _shapes(network, *sizes)
     states = [optimizer.state[parameter] for parameter in network.parameters()]

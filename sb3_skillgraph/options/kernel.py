@@ -11,54 +11,86 @@ import math
 from typing import Any
 
 import numpy as np
+from llvmlite import ir
 from numba import carray, types
+from numba.core import cgutils
 from numba.extending import intrinsic
+from numba.np.arrayobj import make_array
 
-from sb3_skillgraph.options.blas import sgemm
+from sb3_skillgraph.options.blas import SGEMM
 from sb3_skillgraph.options.compiling import compiled, inner
 
-Network = list[np.ndarray]  # weight (out, in) and bias (1, out) of each layer
-Learner = list[Network]  # a network, its target, both moments of Adam, its numbers of steps
-Places = np.ndarray  # of a learner's arrays in memory: address, rows and columns, (5, parameters, 3) whole numbers
+# Where arrays are in memory: address, rows and columns of each. Handed over as arrays each would have to be unpacked.
+Network = np.ndarray  # of the weight (out, in) and the bias (1, out) of each layer, (parameters, 3) whole numbers
+Learner = np.ndarray  # of a network, its target, both moments of Adam, its numbers of steps, (5, parameters, 3)
 Rates = tuple[float, float, float, float, float]  # Adam's learning rate, betas and epsilon; tau, 0 for no target to move
 # Observations, actions, next observations, noise on next actions, rewards, discounts (0 after an end): (batch, width).
 Batch = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 #: Columns of a result up to which turning it pays: BLAS takes its columns for rows, and is slow where they are so short.
 NARROW = 12
+BYTE, FLOAT = ir.IntType(8), ir.FloatType()
+#: Whether a matrix is transposed: as NumPy's, since numba compiles all anew for each of Python's own.
+AS_IT_IS, TURNED = np.bool_(False), np.bool_(True)
+
+
+@intrinsic
+def pointer(typing_context: Any, address: Any) -> Any:
+    """
+    Compiled code calls this with an address: numba has no such function of its own.
+
+    :param address: where a number is
+    :return: the pointer to it
+    """
+
+    def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.inttoptr(arguments[0], context.get_value_type(signature.return_type))
+
+    return types.CPointer(types.float32)(address), code
+
+
+@inner
+def array_at(network: Network, k: int) -> np.ndarray:
+    """
+    :param network: where its arrays are; nothing in here looks whether they are
+    :param k: which of them
+    :return: the array, as it is
+    """
+    return carray(pointer(network[k, 0]), (network[k, 1], network[k, 2]))  # type: ignore[call-arg]
+
+
+@intrinsic
+def sgemm(typing_context: Any, left: Any, right: Any, left_turned: Any, right_turned: Any, result: Any) -> Any:
+    """
+    Compiled code calls this for BLAS to write a product: numba compiles it in a fifth of the time that Python's words take.
+
+    Arguments as of ``product``, and the result, (m, n).
+    """
+
+    def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        arrays = [make_array(signature.args[i])(context, builder, arguments[i]) for i in (0, 1, 4)]
+        sizes = [cgutils.unpack_tuple(builder, array.shape) for array in arrays]
+        (left, right, result), ((left_rows, left_columns), (_, right_columns), (m, n)) = arrays, sizes
+        left_letter, right_letter = (builder.select(turned, BYTE(ord("T")), BYTE(ord("N"))) for turned in arguments[2:4])
+        k = builder.select(arguments[2], left_rows, left_columns)
+        # BLAS goes by columns, and sees every matrix transposed: the right one comes first
+        given = [right_letter, left_letter, n, m, k, FLOAT(1.0), right.data, right_columns, left.data, left_columns]
+        given += [FLOAT(0.0), result.data, n]
+        # It reads all of them where they are; whole numbers of 64 bits also if it expects 32, where the low ones come first
+        places = [x if isinstance(x.type, ir.PointerType) else cgutils.alloca_once_value(builder, x) for x in given]
+        function = ir.FunctionType(ir.VoidType(), [place.type for place in places])
+        builder.call(cgutils.get_or_insert_function(builder.module, function, SGEMM), places)
+        return context.get_dummy_value()
+
+    return types.void(left, right, types.boolean, types.boolean, result), code
 
 
 @inner
 def multiply(left: np.ndarray, right: np.ndarray, left_turned: bool, right_turned: bool) -> np.ndarray:
-    """
-    :param left: (m, k), or (k, m) if it is to be transposed
-    :param right: (k, n), or (n, k) if it is to be transposed
-    :param left_turned: whether it is
-    :param right_turned: whether it is
-    :return: (m, n)
-    """
-    m, k = (left.shape[1], left.shape[0]) if left_turned else left.shape
+    """Return the product by one call of BLAS; arguments as of ``product``."""
+    m = left.shape[1] if left_turned else left.shape[0]
     n = right.shape[0] if right_turned else right.shape[1]
     result = np.empty((m, n), np.float32)
-    # BLAS goes by columns, and sees every matrix transposed: the right one comes first. Whole numbers of 64 bits are read
-    # right by one that expects 32, too, where the low ones come first.
-    turn = np.array([ord("T") if right_turned else ord("N"), ord("T") if left_turned else ord("N")], np.uint8)
-    sizes = np.array([n, m, k, right.shape[1], left.shape[1]], np.int64)
-    factors = np.array([1.0, 0.0], np.float32)
-    sgemm(
-        turn.ctypes,
-        turn[1:].ctypes,
-        sizes.ctypes,
-        sizes[1:].ctypes,
-        sizes[2:].ctypes,
-        factors.ctypes,
-        right.ctypes,
-        sizes[3:].ctypes,
-        left.ctypes,
-        sizes[4:].ctypes,
-        factors[1:].ctypes,
-        result.ctypes,
-        sizes.ctypes,
-    )
+    sgemm(left, right, left_turned, right_turned, result)  # type: ignore[call-arg]
     return result
 
 
@@ -93,9 +125,9 @@ def forward(network: Network, inputs: np.ndarray) -> list[np.ndarray]:
     """
     values = [inputs]
     for k in range(0, len(network), 2):
-        weight, bias = network[k], network[k + 1]
+        weight, bias = array_at(network, k), array_at(network, k + 1)
         is_last = k == len(network) - 2
-        outputs = product(values[-1], weight, False, True)
+        outputs = product(values[-1], weight, AS_IT_IS, TURNED)
         for i in range(outputs.shape[0]):
             for j in range(outputs.shape[1]):
                 outputs[i, j] += bias[0, j]
@@ -113,7 +145,7 @@ def back_to_relu(gradient: np.ndarray, weight: np.ndarray, inputs: np.ndarray) -
     :param inputs: (batch, in), what a ReLU gave the layer
     :return: (batch, in), of the loss by what the ReLU was given
     """
-    result = product(gradient, weight, False, False)
+    result = product(gradient, weight, AS_IT_IS, AS_IT_IS)
     for i in range(result.shape[0]):
         for j in range(result.shape[1]):
             if inputs[i, j] <= 0:
@@ -127,7 +159,9 @@ def column_sums(gradient: np.ndarray) -> np.ndarray:
     :param gradient: (batch, out)
     :return: (1, out)
     """
-    sums = np.zeros((1, gradient.shape[1]), np.float32)
+    sums = np.empty((1, gradient.shape[1]), np.float32)
+    for j in range(gradient.shape[1]):
+        sums[0, j] = 0
     for i in range(gradient.shape[0]):
         for j in range(gradient.shape[1]):
             sums[0, j] += gradient[i, j]
@@ -160,7 +194,8 @@ def step(learner: Learner, k: int, gradient: np.ndarray, rates: Rates) -> None:
     :param gradient: of the loss by the parameter, of its shape
     :param rates: of Adam and of the target
     """
-    parameter, target, average, square, count = learner[0][k], learner[1][k], learner[2][k], learner[3][k], learner[4][k]
+    parameter, target, average = array_at(learner[0], k), array_at(learner[1], k), array_at(learner[2], k)
+    square, count = array_at(learner[3], k), array_at(learner[4], k)
     learning_rate, beta1, beta2, epsilon, tau = rates
     count[0, 0] += 1
     # All of these in double before they are rounded: 1 - beta2 would have three digits in single precision.
@@ -189,23 +224,23 @@ def backward(learner: Learner, values: list[np.ndarray], gradient: np.ndarray, r
     :param rates: of Adam and of the target
     """
     for layer in range(len(values) - 2, -1, -1):
-        weight_gradient = product(gradient, values[layer], True, False)
+        weight_gradient = product(gradient, values[layer], TURNED, AS_IT_IS)
         bias_gradient = column_sums(gradient)
         if layer > 0:
             # Before the weight learns: the gradient is that of the weight in use.
-            gradient = back_to_relu(gradient, learner[0][2 * layer], values[layer])
+            gradient = back_to_relu(gradient, array_at(learner[0], 2 * layer), values[layer])
         step(learner, 2 * layer, weight_gradient, rates)
         step(learner, 2 * layer + 1, bias_gradient, rates)
 
 
 @inner
-def update_critics(batch: Batch, actor_target: Network, critics: list[Learner], noise_clip: float, rates: Rates) -> float:
+def update_critics(batch: Batch, actor_target: Network, critics: np.ndarray, noise_clip: float, rates: Rates) -> float:
     """
     Teach all critics the same values.
 
     :param batch: what they learn from
     :param actor_target: the target of the actor
-    :param critics: one or more
+    :param critics: one or more learners, (critics, 5, parameters, 3)
     :param noise_clip: the most that noise changes a next action by
     :param rates: of the critics
     :return: the mean squared error, summed over critics
@@ -226,22 +261,22 @@ def update_critics(batch: Batch, actor_target: Network, critics: list[Learner], 
     next_inputs = side_by_side(next_observations, next_actions)
     # The next values are the smallest that a critic's target gives.
     next_values = forward(critics[0][1], next_inputs)[-1]
-    for critic in critics[1:]:
-        others = forward(critic[1], next_inputs)[-1]
+    for k in range(1, len(critics)):
+        others = forward(critics[k][1], next_inputs)[-1]
         for i in range(n):
             if others[i, 0] < next_values[i, 0] or np.isnan(others[i, 0]):
                 next_values[i, 0] = others[i, 0]
     # Move each critic towards them.
     inputs = side_by_side(observations, actions)
     loss = 0.0
-    for critic in critics:
-        values = forward(critic[0], inputs)
+    for k in range(len(critics)):
+        values = forward(critics[k][0], inputs)
         gradient = values[-1]
         for i in range(n):
             error = gradient[i, 0] - (rewards[i, 0] + discounts[i, 0] * next_values[i, 0])
             loss += error * error / n
             gradient[i, 0] = np.float32(2 / n) * error
-        backward(critic, values, gradient, rates)
+        backward(critics[k], values, gradient, rates)
     return loss
 
 
@@ -260,7 +295,7 @@ def update_actor(observations: np.ndarray, actor: Learner, critic: Network, pena
     n, n_observations = observations.shape
     values = forward(actor[0], observations)
     before_tanh = values[-1]
-    actions = np.empty_like(before_tanh)
+    actions = np.empty(before_tanh.shape, np.float32)
     loss = 0.0
     for i in range(n):
         for j in range(actions.shape[1]):
@@ -273,10 +308,10 @@ def update_actor(observations: np.ndarray, actor: Learner, critic: Network, pena
         loss -= gradient[i, 0] / n
         gradient[i, 0] = np.float32(-1 / n)
     for layer in range(len(critic_values) - 2, 0, -1):
-        gradient = back_to_relu(gradient, critic[2 * layer], critic_values[layer])
-    by_inputs = product(gradient, critic[0], False, False)
+        gradient = back_to_relu(gradient, array_at(critic, 2 * layer), critic_values[layer])
+    by_inputs = product(gradient, array_at(critic, 0), AS_IT_IS, AS_IT_IS)
     # Go back through the tanh, before which the penalty comes in.
-    by_actions = np.empty_like(actions)
+    by_actions = np.empty(actions.shape, np.float32)
     for i in range(n):
         for j in range(actions.shape[1]):
             slope = np.float32(1) - actions[i, j] * actions[i, j]
@@ -285,36 +320,10 @@ def update_actor(observations: np.ndarray, actor: Learner, critic: Network, pena
     return loss
 
 
-@intrinsic
-def pointer(typing_context: Any, address: Any) -> Any:
-    """
-    Compiled code calls this with an address: numba has no such function of its own.
-
-    :param address: where a number is
-    :return: the pointer to it
-    """
-    signature = types.CPointer(types.float32)(address)
-
-    def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return builder.inttoptr(arguments[0], context.get_value_type(signature.return_type))
-
-    return signature, code
-
-
-@inner
-def learner_at(places: Places) -> Learner:
-    """
-    :param places: where the arrays of a learner are; nothing in here looks whether they are
-    :return: the arrays, as they are
-    """
-    # Handed over as arrays each would have to be unpacked, and every number of them be compiled for anew.
-    return [[carray(pointer(place[0]), (place[1], place[2])) for place in network] for network in places]  # type: ignore[call-arg]
-
-
 @compiled
 def update(
     batch: Batch,
-    actor: Places,
+    actor: Learner,
     critics: np.ndarray,
     actor_rates: Rates,
     critic_rates: Rates,
@@ -327,7 +336,7 @@ def update(
 
     :param batch: what they learn from
     :param actor: the actor
-    :param critics: one or more, (critics, 5, parameters, 3)
+    :param critics: one or more learners, (critics, 5, parameters, 3)
     :param actor_rates: of the actor
     :param critic_rates: of the critics
     :param noise_clip: see ``update_critics``
@@ -335,9 +344,7 @@ def update(
     :param with_actor: whether the actor learns, too
     :return: the critics' loss and the actor's (NaN without the actor)
     """
-    actor_learner = learner_at(actor)
-    critic_learners = [learner_at(critic) for critic in critics]
-    critic_loss = update_critics(batch, actor_learner[1], critic_learners, noise_clip, critic_rates)
+    critic_loss = update_critics(batch, actor[1], critics, noise_clip, critic_rates)
     if not with_actor:
         return critic_loss, math.nan
-    return critic_loss, update_actor(batch[0], actor_learner, critic_learners[0][0], penalty, actor_rates)
+    return critic_loss, update_actor(batch[0], actor, critics[0][0], penalty, actor_rates)
