@@ -2,9 +2,8 @@
 
 import copy
 from collections.abc import Iterable, Sequence
-from functools import partial
 from inspect import signature
-from typing import Any, ClassVar, Literal, TypeVar
+from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 import torch as th
@@ -21,17 +20,8 @@ from stable_baselines3.td3.policies import MultiInputPolicy
 
 from sb3_skillgraph import persistence
 from sb3_skillgraph.arguments import check_arguments, check_attributes
-from sb3_skillgraph.envs.wrappers import told_limit
 from sb3_skillgraph.events import Event
-from sb3_skillgraph.goal_env import (
-    GoalSpec,
-    as_batch,
-    as_goal,
-    check_finite,
-    env_attribute,
-    refuse_changed_goals,
-    rows,
-)
+from sb3_skillgraph.goal_env import GoalSpec, as_batch, as_goal, check_finite, refuse_changed_goals, rows
 from sb3_skillgraph.interrupts import Interrupts
 from sb3_skillgraph.learning.episodes import Episodes
 from sb3_skillgraph.learning.salience import Salience
@@ -48,8 +38,6 @@ from sb3_skillgraph.running import Run, RunnerState
 from sb3_skillgraph.saving import PathOrFile, load_tree, save_tree
 from sb3_skillgraph.schema import check_learned
 from sb3_skillgraph.vec_env import LeanVecEnv
-
-SelfSkillGraphAgent = TypeVar("SelfSkillGraphAgent", bound="SkillGraphAgent")
 
 
 class SkillGraphAgent(OffPolicyAlgorithm):
@@ -159,8 +147,6 @@ class SkillGraphAgent(OffPolicyAlgorithm):
         sb3s = {name: value for name, value in self._arguments.items() if name in shared}
         sb3s["action_noise"] = action_noise if isinstance(action_noise, ActionNoise) else None
         super().__init__(env=env, **sb3s, sde_support=False, support_multi_env=True)  # type: ignore[arg-type]
-        if rules is not None and not isinstance(rules, PaperRules):
-            raise ValueError(f"rules must be PaperRules() or None, not {rules!r}: SkillGraphAgent(..., **PAPER).")
         self.rules = rules
         self._interrupts = Interrupts()
         self._env_snapshot: dict[str, Any] | None = None
@@ -190,7 +176,7 @@ class SkillGraphAgent(OffPolicyAlgorithm):
             from sb3_skillgraph.paper.parts import PaperParts  # when it is used: networkx takes a while to import
 
             self.parts = PaperParts(self, self._spec, self._arguments)
-        self._heed_time_limit()
+        self.parts.heed_time_limit(self.env)
         # Under SB3's names as well: CheckpointCallback looks for the one, users for the other.
         self.replay_buffer = self.parts.store
         self.policy = self.parts.walker.learner.policy
@@ -202,13 +188,6 @@ class SkillGraphAgent(OffPolicyAlgorithm):
         if isinstance(observation, dict):
             return self.predict(observation, *args, **kwargs)
         return type(self.policy).predict(self.policy, observation, *args, **kwargs)
-
-    def _heed_time_limit(self) -> None:
-        """Make plans for the episodes of the environment: as long as it tells, else as those that it cuts while learning."""
-        limit = None if self.env is None else told_limit(partial(env_attribute, self.env))
-        self.parts.rollout.is_told_limit = limit is not None
-        if limit is not None:
-            self.parts.planner.horizon = limit
 
     # -- what it knows ------------------------------------------------------------------------------------------------
 
@@ -243,14 +222,14 @@ class SkillGraphAgent(OffPolicyAlgorithm):
     # -- learning -----------------------------------------------------------------------------------------------------
 
     def learn(
-        self: SelfSkillGraphAgent,
+        self,
         total_timesteps: int,
         callback: MaybeCallback = None,
         log_interval: int | None = 4,
         tb_log_name: str = "SkillGraph",
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
-    ) -> SelfSkillGraphAgent:
+    ) -> Self:
         """
         Explore and learn, without reward. The arguments are those of SB3's off-policy algorithms.
 
@@ -434,16 +413,7 @@ class SkillGraphAgent(OffPolicyAlgorithm):
     def _running_state(self, n_envs: int, state: tuple[np.ndarray, ...] | None) -> RunnerState:
         if state is None:
             return RunnerState.fresh(n_envs, self._spec.goal_dim, self._spec.observation_dim)
-        known = self._known_state(state)
-        if len(known.option) != n_envs:
-            raise ValueError(f"The state is of {len(known.option)} environments, not of {n_envs}.")
-        return known
-
-    @staticmethod
-    def _known_state(state: Any) -> RunnerState:
-        if not isinstance(state, tuple) or len(state) != len(RunnerState._fields):
-            raise ValueError(f"This is no state that predict has returned: {state!r:.60}.")
-        return RunnerState(*state)
+        return RunnerState.returned(state, n_envs)
 
     def running(self, state: tuple[np.ndarray, ...]) -> list[str]:
         """
@@ -453,7 +423,7 @@ class SkillGraphAgent(OffPolicyAlgorithm):
         :return: the option's id for each environment
         :raises ValueError: if it is no such state
         """
-        return [str(option) for option in self._known_state(state).option]
+        return [str(option) for option in RunnerState.returned(state).option]
 
     def plan(
         self, obs: dict[str, np.ndarray], goal: np.ndarray | None = None, state: tuple[np.ndarray, ...] | None = None
@@ -486,13 +456,13 @@ class SkillGraphAgent(OffPolicyAlgorithm):
         return self.parts.plan(running.pursuing(target[None]), batch["achieved_goal"][0], target)
 
     def adapt(
-        self: SelfSkillGraphAgent,
+        self,
         goal: np.ndarray,
         *,
         start: np.ndarray | None = None,
         total_timesteps: int = 10_000,
         callback: MaybeCallback = None,
-    ) -> SelfSkillGraphAgent:
+    ) -> Self:
         """
         Learn to reach a goal the graph does not reach yet (section 3.3, cases b and c).
 
@@ -511,16 +481,14 @@ class SkillGraphAgent(OffPolicyAlgorithm):
             raise ValueError(f"total_timesteps must be 1 at least, not {total_timesteps!r}.")
         target = as_goal(goal, self._spec.goal_dim)
         assert self.env is not None, "Give the agent an environment (set_env) before adapt."
-        self.episodes.reset_options = {} if start is None else {"start": as_goal(start, self._spec.goal_dim)}
+        options = {} if start is None else {"start": as_goal(start, self._spec.goal_dim)}
         self._last_obs, self._env_snapshot = None, None
         try:
-            self.env.set_options(self.episodes.reset_options)
             self.parts.missions.pinned = target
-            return self.learn(total_timesteps, callback, log_interval=None, reset_num_timesteps=False)
+            with self.episodes.starting_with(options):
+                return self.learn(total_timesteps, callback, log_interval=None, reset_num_timesteps=False)
         finally:
-            self.parts.missions.pinned = None
-            self.env.set_options()
-            self.episodes.reset_options, self._last_obs = {}, None
+            self.parts.missions.pinned = self._last_obs = None
 
     # -- saving and loading -------------------------------------------------------------------------------------------
 
@@ -577,7 +545,7 @@ class SkillGraphAgent(OffPolicyAlgorithm):
 
     @classmethod
     def load(
-        cls: type[SelfSkillGraphAgent],
+        cls,
         path: PathOrFile,
         env: GymEnv | None = None,
         device: th.device | str = "auto",
@@ -585,7 +553,7 @@ class SkillGraphAgent(OffPolicyAlgorithm):
         print_system_info: bool = False,
         force_reset: bool = False,
         **kwargs: Any,
-    ) -> SelfSkillGraphAgent:
+    ) -> Self:
         """
         Load an agent; nothing in the file is ever executed. Arguments as SB3 has them.
 
@@ -605,7 +573,7 @@ class SkillGraphAgent(OffPolicyAlgorithm):
         known = {name: value for name, value in (custom_objects or {}).items() if name in signature(cls).parameters}
         return persistence.load(cls, path, env, device, {**known, **kwargs}, force_reset)
 
-    def copy(self: SelfSkillGraphAgent, env: GymEnv) -> SelfSkillGraphAgent:
+    def copy(self, env: GymEnv) -> Self:
         """Return a copy with an environment of its own, replay buffer included; what it learns leaves this one as it is."""
         return persistence.copy(self, env)
 
@@ -626,6 +594,6 @@ class SkillGraphAgent(OffPolicyAlgorithm):
                 "load(path, env=env) takes any number."
             )
         super().set_env(env, force_reset)
-        self._heed_time_limit()
+        self.parts.heed_time_limit(self.env)
         if force_reset:
             self._env_snapshot, self._loaded = None, None

@@ -19,6 +19,7 @@ from sb3_skillgraph.learning.salience import FrontierSalience, RandomSalience, S
 from sb3_skillgraph.memory.store import TransitionStore
 from sb3_skillgraph.metric import Metric, as_metric
 from sb3_skillgraph.options.learner import OptionDDPG, OptionLearner, OptionTD3
+from sb3_skillgraph.rules import PaperRules
 
 #: Steps, or episodes, after which there is training at the latest: ``learn`` does not end before.
 LONGEST_ROLLOUT = 10_000
@@ -83,6 +84,8 @@ def check_arguments(arguments: dict[str, Any]) -> None:
         given["learning_rate"] = 0.0
     if given["action_noise"] is None or isinstance(given["action_noise"], ActionNoise):
         given["action_noise"] = 0.0
+    if given["rules"] is not None and not isinstance(given["rules"], PaperRules):
+        raise ValueError(f"rules must be PaperRules() or None, not {given['rules']!r}: SkillGraphAgent(..., **PAPER).")
     for name, check in _CHECKS.items():
         check(given[name].item() if isinstance(given[name], np.generic) else given[name], name)
     if isinstance(train_freq, tuple) and len(train_freq) != 2:

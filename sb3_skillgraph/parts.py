@@ -1,14 +1,17 @@
 """The parts of an agent, and how they are put together (Figure 10)."""
 
+from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_skillgraph.arguments import HORIZON, find_salience, goal_metric, option_class, option_kwargs
 from sb3_skillgraph.checking import array
-from sb3_skillgraph.goal_env import GoalSpec, find_view
+from sb3_skillgraph.envs.wrappers import told_limit
+from sb3_skillgraph.goal_env import GoalSpec, env_attribute, find_view
 from sb3_skillgraph.graph import SkillGraph
 from sb3_skillgraph.learning.growth import Growth, Skills
 from sb3_skillgraph.learning.missions import Agenda, Missions
@@ -88,6 +91,16 @@ class Parts:
         self.witness = Witness(self.graph, self.planner.choice_model, agent.n_envs, growth)
         # Who learns acts by the policy as it is.
         return Runner(self.graph, self.planner, self.walker.actor, self.view, self.skills)
+
+    def heed_time_limit(self, env: VecEnv | None) -> None:
+        """Make plans for the episodes of an environment: as long as it tells, else as those that it cuts while learning.
+
+        :param env: the environment; None if there is none
+        """
+        limit = None if env is None else told_limit(partial(env_attribute, env))
+        self.rollout.is_told_limit = limit is not None
+        if limit is not None:
+            self.planner.horizon = limit
 
     def options(self) -> Any:
         """Return all options: the walks, one to each event, which share their SB3 model."""

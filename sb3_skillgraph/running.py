@@ -1,7 +1,7 @@
 """Which options run, and which have run in the episode: what is remembered from one step to the next."""
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -96,6 +96,21 @@ class RunnerState(NamedTuple):
         run_ids, run_numbers = np.zeros((n_envs, MAX_RUNS), dtype=ID), np.zeros((n_envs, MAX_RUNS))
         running = (ids, ids, aim, numbers, numbers, ids, aim, numbers, seen, seen, numbers)
         return cls(*running, run_ids, run_ids, run_ids, run_numbers.astype(bool), run_numbers, run_numbers)
+
+    @classmethod
+    def returned(cls, state: Any, n_envs: int | None = None) -> "RunnerState":
+        """Return the state that an agent's ``predict`` has returned as one of these.
+
+        :param state: what it returned
+        :param n_envs: number of environments that it must be of; None for any
+        :raises ValueError: if it is no such state
+        """
+        if not isinstance(state, tuple) or len(state) != len(cls._fields):
+            raise ValueError(f"This is no state that predict has returned: {state!r:.60}.")
+        known = cls(*state)
+        if n_envs not in (None, len(known.option)):
+            raise ValueError(f"The state is of {len(known.option)} environments, not of {n_envs}.")
+        return known
 
     def begun_anew(self, where: np.ndarray, *, same_episode: bool = False) -> "RunnerState":
         """Return a state that is fresh for some environments.

@@ -4,6 +4,8 @@ import copy
 import functools
 import time
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from itertools import compress
 from typing import Any
 
@@ -25,6 +27,21 @@ class Episodes:
     def __init__(self, agent: OffPolicyAlgorithm) -> None:
         self.agent = agent
         self.reset_options: dict[str, Any] = {}  # while adapting: where episodes start
+
+    @contextmanager
+    def starting_with(self, reset_options: dict[str, Any]) -> Iterator[None]:
+        """Begin all episodes with the same options of ``reset``.
+
+        :param reset_options: of all resets in the block
+        """
+        assert self.agent.env is not None
+        self.reset_options = reset_options
+        try:
+            self.agent.env.set_options(reset_options)
+            yield
+        finally:
+            self.reset_options = {}
+            self.agent.env.set_options()
 
     def terminated(self, dones: np.ndarray, infos: list[dict[str, Any]]) -> np.ndarray:
         """Tell which environments have ended for good; a time limit is no such end.
