@@ -30,3 +30,13 @@ def inner(function: Callable[..., Any]) -> Callable[..., Any]:
     :return: the same in machine code
     """
     return compiled(function, no_cpython_wrapper=True)
+
+
+def inlined(function: Callable[..., Any]) -> Callable[..., Any]:
+    """
+    Compile a function that is called in one place as a part of what calls it: a large one is not optimised twice then.
+
+    :param function: one that numba understands
+    :return: the same for compiled functions to call
+    """
+    return compiled(function, no_cpython_wrapper=True, inline="always")

@@ -18,7 +18,7 @@ from numba.extending import intrinsic
 from numba.np.arrayobj import make_array
 
 from sb3_skillgraph.options.blas import SGEMM
-from sb3_skillgraph.options.compiling import compiled, inner
+from sb3_skillgraph.options.compiling import compiled, inlined, inner
 
 # Where arrays are in memory: address, rows and columns of each. Handed over as arrays each would have to be unpacked.
 Network = np.ndarray  # of the weight (out, in) and the bias (1, out) of each layer, (parameters, 3) whole numbers
@@ -233,7 +233,7 @@ def backward(learner: Learner, values: list[np.ndarray], gradient: np.ndarray, r
         step(learner, 2 * layer + 1, bias_gradient, rates)
 
 
-@inner
+@inlined
 def update_critics(batch: Batch, actor_target: Network, critics: np.ndarray, noise_clip: float, rates: Rates) -> float:
     """
     Teach all critics the same values.
@@ -280,7 +280,7 @@ def update_critics(batch: Batch, actor_target: Network, critics: np.ndarray, noi
     return loss
 
 
-@inner
+@inlined
 def update_actor(observations: np.ndarray, actor: Learner, critic: Network, penalty: float, rates: Rates) -> float:
     """
     Teach the actor to climb a critic.
