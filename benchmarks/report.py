@@ -274,6 +274,20 @@ def throughput() -> str:
     )
 
 
+def updates() -> str:
+    """Return what one update costs, beside SB3's and, where it was measured, SBX's."""
+    parts = []
+    for case in document("update.json")["cases"]:
+        fresh = case["fresh"]
+        peer = f", SBX's {fresh['sbx']:.2f} ms" if "sbx" in fresh else ""
+        layers = "-".join(map(str, case["net_arch"]))
+        parts.append(
+            f"{case['algorithm']} {layers}, minibatches of {case['batch_size']}: {fresh['kernel']:.2f} ms, SB3's "
+            f"{fresh['sb3']:.2f} ms ({fresh['speedup']:.2f} times ours; aged {case['aged']['speedup']:.2f}){peer}"
+        )
+    return "; ".join(parts)
+
+
 def soak() -> str:
     """Return how a million steps went."""
     result = document("soak.json")
@@ -331,7 +345,7 @@ def page() -> str:
         function.__name__: function
         for function in (ants, command, curves_of, few_shot, kept, methods, ogbench, older, promises, scaling, soak)
     }
-    known |= {function.__name__: function for function in (straight_on, throughput, wall_clock)}
+    known |= {function.__name__: function for function in (straight_on, throughput, updates, wall_clock)}
 
     def fill(match: re.Match[str]) -> str:
         name, *arguments = match[1].split()

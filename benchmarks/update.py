@@ -7,8 +7,9 @@ SB3 has trained in 5000 steps of a ``SkillGraphAgent`` on PointMaze, their buffe
 died, and Adam's moments of dead units have decayed into denormal numbers, which many processors are slow at.
 
 Beside them, and in turn with them, the matrix products that the kernel's update cannot do without: a plain call of the same
-BLAS each, the weights where they are. On a GPU (``--device cuda``), where there is no kernel, only SB3's and torch's updates
-are compared, fresh.
+BLAS each, the weights where they are; and, where it is installed (``pip install '.[peers]'``), the update of SBX, which is
+SB3 in JAX, on fresh models: compiled, too, and on the one core that the process is bound to. On a GPU (``--device cuda``),
+where there is no kernel, only SB3's and torch's updates are compared, fresh.
 
 Run it with ``OMP_NUM_THREADS=1 python -m benchmarks.update --out benchmarks/results/update.json``.
 """
@@ -16,7 +17,10 @@ Run it with ``OMP_NUM_THREADS=1 python -m benchmarks.update --out benchmarks/res
 import argparse
 import copy
 import dataclasses
+import importlib
+import importlib.util
 import json
+import os
 import platform
 import statistics
 import time
@@ -73,7 +77,7 @@ CASES = [
     Case("DDPG", (128, 128), 128),
 ]
 OVER_PRODUCTS = 1.3, 1.6  # aim and floor of the kernel's time over that of its products
-COLUMNS = "sb3", "reference", "kernel", "products", "speedup", "over"
+COLUMNS = "sb3", "sbx", "reference", "kernel", "products", "speedup", "over"
 AGEING = 1.1  # what an aged model's time may be over a fresh one's
 
 
@@ -283,6 +287,19 @@ def timed(function: Callable[[], object]) -> float:
     return time.perf_counter() - start
 
 
+def peers(case: Case) -> dict[str, TD3]:
+    """
+    :param case: what to build it for
+    :return: SBX's model, where SBX is installed
+    """
+    if importlib.util.find_spec("sbx") is None:
+        return {}
+    # JAX takes as many threads as there are cores for the process, and it looks when it is imported.
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+    return {"sbx": build(getattr(importlib.import_module("sbx"), case.algorithm), case)}
+
+
 def contenders(case: Case, device: str) -> dict[str, TD3]:
     """
     :param case: what to build them for
@@ -332,6 +349,7 @@ def main() -> None:
         name = f"{case.algorithm} {'-'.join(map(str, case.net_arch))} B={case.batch_size}"
         ages = {"fresh": contenders(case, arguments.device)}
         if on_cpu:
+            ages["fresh"] = {**peers(case), **ages["fresh"]}
             ages["aged"] = contenders(case, arguments.device)
             old = walker(case)
             grow_old(list(ages["aged"].values()), old)
