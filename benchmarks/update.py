@@ -344,7 +344,7 @@ def main() -> None:
     th.set_num_threads(1)
     on_cpu = arguments.device == "cpu"
     results = []
-    print(f"{'case':<24}{'age':<7}" + "".join(f"{name:>{len(name) + 2}}" for name in COLUMNS))
+    print(f"{'case':<24}{'age':<7}" + "".join(f"{name:>11}" for name in COLUMNS))
     for case in CASES:
         name = f"{case.algorithm} {'-'.join(map(str, case.net_arch))} B={case.batch_size}"
         ages = {"fresh": contenders(case, arguments.device)}
@@ -357,7 +357,7 @@ def main() -> None:
         if on_cpu:
             rows["aged"]["denormals"] = denormals(old)
         for age, row in rows.items():
-            columns = "".join(f"{row.get(key, float('nan')):{len(key) + 2}.2f}" for key in COLUMNS)
+            columns = "".join(f"{row.get(key, float('nan')):11.2f}" for key in COLUMNS)
             print(f"{name:<24}{age:<7}{columns}", flush=True)
         if on_cpu:
             print(f"{'':<24}{verdict(case, rows['fresh'], rows['aged'])}", flush=True)
