@@ -133,6 +133,21 @@ def test_the_page_of_results_is_what_the_tables_say(tmp_path: Path, monkeypatch:
     assert readme.read_text() == (ROOT / "README.md").read_text()
 
 
+def test_the_picture_of_learning_shows_every_method_and_its_seeds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pictures, collect = module("pictures"), module("collect")
+    drawn = {}
+    monkeypatch.setattr(pictures, "PAGE", tmp_path / "results.md")
+    monkeypatch.setattr(pictures, "plot_curves", lambda axes, curves, methods, title: drawn.update({title: curves}))
+    pictures.main()
+    assert (tmp_path / "learning_curves.png").stat().st_size > 0
+    assert tuple(next(iter(drawn.values()))) == pictures.METHODS
+    rows = collect.read(collect.RESULTS / "paper" / "curves.csv")
+    ends = [row["success_rate"] for row in rows if row["method"] == "paper-rrt" and row["steps"] == 300_000]
+    curve = next(iter(drawn.values()))["paper-rrt"]
+    assert curve.steps[-1] == 300_000
+    np.testing.assert_allclose([curve.low[-1], curve.mean[-1], curve.high[-1]], [min(ends), np.mean(ends), max(ends)])
+
+
 @pytest.mark.parametrize(
     ("low", "high", "told"), [(0.1, 0.3, "told apart"), (-0.3, -0.1, "told apart"), (-0.1, 0.1, "not told apart")]
 )
