@@ -36,7 +36,7 @@ def main() -> None:
     shown = set()
     for axes, (title, plans) in zip(panels, PANELS.items(), strict=True):
         tests = [row for plan in plans for row in read(RESULTS / plan / "curves.csv")]
-        tests = [row for row in tests if row["environment"].startswith("medium")]
+        tests = [row for row in tests if row["environment"] == "medium"]
         rows = {method: [row for row in tests if row["method"] == method] for method in METHODS}
         curves = {method: curve(mine) for method, mine in rows.items() if mine}
         plot_curves(axes, curves, METHODS, title)

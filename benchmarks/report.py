@@ -23,7 +23,6 @@ ENOUGH_PLANS = 100
 TASKS = {
     "umaze": "Point maze, UMaze",
     "medium": "Point maze, Medium",
-    "medium-1400k": "Point maze, Medium",
     "hard": "Point maze, Hard",
     "car-medium": "Car, Medium",
     "key-door": "Key and door",
