@@ -6,7 +6,7 @@ python -m benchmarks.pictures
 import numpy as np
 
 from benchmarks.collect import RESULTS, Row, read
-from benchmarks.report import PAGE
+from benchmarks.report import PAGE, rates_by_steps
 from sb3_skillgraph.plotting.figures import save_figure
 from sb3_skillgraph.plotting.paper_figures import Curve, add_legend, new_panels, plot_curves
 
@@ -24,10 +24,9 @@ def curve(rows: list[Row]) -> Curve:
 
     :param rows: of its tests
     """
-    steps = sorted({row["steps"] for row in rows})
-    rates = [[row["success_rate"] for row in rows if row["steps"] == step] for step in steps]
-    least, most = (np.array([end(each) for each in rates]) for end in (min, max))
-    return Curve(np.array(steps), np.array([np.mean(each) for each in rates]), least, most)
+    by_steps = rates_by_steps(rows)
+    mean, least, most = (np.array([of(rates) for rates in by_steps.values()]) for of in (np.mean, min, max))
+    return Curve(np.array(list(by_steps)), mean, least, most)
 
 
 def main() -> None:

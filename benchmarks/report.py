@@ -125,6 +125,15 @@ def methods(plan: str) -> str:
     return table(head, lines)
 
 
+def rates_by_steps(rows: Sequence[Row]) -> dict[int, list[float]]:
+    """Return the success of all seeds after each number of steps, ascending.
+
+    :param rows: of a method's tests
+    """
+    ascending = sorted({row["steps"] for row in rows})
+    return {steps: [row["success_rate"] for row in rows if row["steps"] == steps] for steps in ascending}
+
+
 def curves_of(plan: str, method: str) -> str:
     """Return how a method's success grows with the steps, one line for each of a plan's tasks."""
     environments = [row["environment"] for row in summary(plan) if row["method"] == method]
@@ -132,10 +141,7 @@ def curves_of(plan: str, method: str) -> str:
     lines = []
     for environment in environments:
         here = [row for row in rows if row["environment"] == environment]
-        by_steps = {
-            steps: [r["success_rate"] for r in here if r["steps"] == steps] for steps in sorted({r["steps"] for r in here})
-        }
-        text = ", ".join(f"{np.mean(rates):.2f} ({steps})" for steps, rates in by_steps.items())
+        text = ", ".join(f"{np.mean(rates):.2f} ({steps})" for steps, rates in rates_by_steps(here).items())
         lines.append(f"* {TASKS[environment]}: {text}.")
     return "\n".join(lines)
 
