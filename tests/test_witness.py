@@ -74,6 +74,23 @@ def test_a_place_that_belongs_to_no_event_becomes_a_landmark() -> None:
     assert not any(walk(witness, straight(5.0)))  # nothing is new the second time
 
 
+@every_time
+@given(seeds)
+def test_every_crossing_over_three_radii_has_an_event_in_its_middle(seed: int) -> None:
+    """Where it fails its halves are there: no walk has to be split."""
+    rng, witness = np.random.default_rng(seed), make_witness()
+    points = np.cumsum(0.4 * np.sign(rng.normal(0.2, 1.0, (300, 2))), axis=0)
+    witness.begin(0, points[0])
+    for point in points[1:]:
+        witness.step(0, point)
+    graph, pairs = witness.graph, forward(witness.graph)
+    where = {event.id: event.center for event in graph.events}
+    long = [(source, target) for source, target in pairs if graph.metric.distance(where[source], where[target]) >= 3.0]
+    assert len(long) > 5
+    for source, target in long:
+        assert any((source, middle) in pairs and (middle, target) in pairs for middle in where)
+
+
 def test_visits_count_how_often_an_event_was_entered() -> None:
     witness = make_witness()
     walk(witness, straight(5.0))
