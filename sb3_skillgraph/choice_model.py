@@ -20,9 +20,6 @@ FAR = 2.0
 #: Share of the success of a walk to an event that is left for a goal beside its centre.
 BESIDE = 0.98
 
-#: Rows of all edges.
-ALL = slice(None)
-
 #: Weights of runs by the events that walks begin in, and by those that they lead to: of some of the runs, and of all. Of
 #: hasty walks, which are no kin of others, they stand behind those of all others.
 ByEnd = list[tuple[np.ndarray, np.ndarray]]
@@ -57,29 +54,15 @@ class ChoiceModel:
             self._known = self.version, *self._gather()
         return self._known[1:]
 
-    def kinds(self, rows: slice = ALL) -> Kind:
-        """Return what is known of the graph's walks beside their runs.
-
-        :param rows: of which edges
-        """
+    def kinds(self) -> Kind:
+        """Return what is known of the graph's walks beside their runs."""
         graph, edges = self.graph, self.graph.edges
-        ends = graph.centers[edges.target[rows]], graph.centers[edges.source[rows]]
+        ends = graph.centers[edges.target], graph.centers[edges.source]
         distance, changes = graph.metric.travel(*ends), graph.metric.mismatches(*ends)
-        return Kind(distance, edges.crossing_steps[rows], edges.forward[rows], edges.backward[rows], changes)
-
-    def straight_on(self, begin: np.ndarray, end: np.ndarray, seen: np.ndarray) -> Kind:
-        """Return what is known of walks that no edge stands for.
-
-        :param begin: where they begin, shape ``(n, goal_dim)``, or ``(goal_dim,)`` if that is the same
-        :param end: where they lead, likewise
-        :param seen: 1 where somebody has been near that, 0 elsewhere; shape ``(n,)``
-        """
-        distance, changes = self.graph.metric.travel(begin, end), self.graph.metric.mismatches(begin, end)
-        return Kind(distance, seen * self.model.steps_per_radius * distance, seen, np.zeros_like(seen), changes)
+        return Kind(distance, edges.crossing_steps, edges.forward, edges.backward, changes)
 
     def _gather(self) -> tuple[Choices, ByEnd]:
-        edges, kinds = self.graph.edges, self.kinds()
-        aging = self.graph.aging(edges.updated)
+        edges, aging, kinds = self.graph.edges, self.graph.aging(), self.kinds()
         # What has been tried tells by its own runs, what has not by what others of its kind and place have done
         successes, failures = edges.successes * aging, edges.failures * aging
         apart = len(self.graph.events) * self.model.is_hasty(kinds)  # hasty walks have events of their own, behind the others
@@ -145,7 +128,7 @@ class ChoiceModel:
         landing = edges.landing[rows]
         away = graph.metric.travel(graph.centers[landing], graph.centers[edges.source[rows]][:, None])
         far = (landing == NOWHERE) | (away > FAR * (kinds.distance[rows, None] + 1.0))
-        result[rows] = (edges.landing_weight[rows] * far).sum(axis=1) * graph.aging(edges.updated[rows])
+        result[rows] = (edges.landing_weight[rows] * far).sum(axis=1) * graph.aging()[rows]
         return result
 
     # -- what an episode adds -----------------------------------------------------------------------------------------
@@ -283,7 +266,9 @@ class ChoiceModel:
         :param seen: 1 where somebody has been near the target, 0 elsewhere
         :param runs: of the episode
         """
-        n, kind = len(source), self.straight_on(begin, end, seen)
+        n, metric = len(source), self.graph.metric
+        distance, changes = metric.travel(begin, end), metric.mismatches(begin, end)
+        kind = Kind(distance, seen * self.model.steps_per_radius * distance, seen, np.zeros(n), changes)
         steps = self.model.steps(kind)
         runs_known = np.zeros(n), np.zeros(n), steps, self.model.patience * timeout(steps)
         landings = np.full((n, MAX_LANDINGS), NOWHERE), np.zeros((n, MAX_LANDINGS))

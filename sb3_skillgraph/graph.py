@@ -154,7 +154,7 @@ class SkillGraph:
     def _pour(self, old: Edges, row: int, source: int, target: int, new_index: np.ndarray) -> None:
         """Add the record of an old edge to the one that takes its place."""
         edges, new = self.edges, self._current_row(source, target)
-        weight = self.aging(old.updated[row])
+        weight = self._aging(old.updated[row])
         n_old, n_new = old.forward[row] + old.backward[row], edges.forward[new] + edges.backward[new]
         steps = n_old * old.crossing_steps[row] + n_new * edges.crossing_steps[new]
         edges.crossing_steps[new] = steps / max(n_old + n_new, 1.0)
@@ -221,18 +221,18 @@ class SkillGraph:
     def _current_row(self, source: int, target: int) -> int:
         """Return the row of an edge, its weights as of now."""
         row, edges = self.edges.add(source, target, self.now), self.edges
-        weight = self.aging(edges.updated[row])
+        weight = self._aging(edges.updated[row])
         for name in (*RECORD, "landing_weight"):
             getattr(edges, name)[row] *= weight
         edges.updated[row] = self.now
         return row
 
-    def aging(self, updated: Any) -> Any:
-        """Return by how much weights have aged, a number or an array.
-
-        :param updated: the time, in updates of the walker, for which they held
-        """
+    def _aging(self, updated: Any) -> Any:
         return ((updated + YOUNG) / (self.now + YOUNG)) ** AGING
+
+    def aging(self) -> np.ndarray:
+        """Return by how much the weights of each edge have aged since they were updated, shape ``(n_edges,)``."""
+        return self._aging(self.edges.updated)
 
     def bound_degree(self, worth: np.ndarray) -> None:
         """Let go of the edges of each event that are worth least, where it has too many.

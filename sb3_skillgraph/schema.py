@@ -256,12 +256,12 @@ def _rollout(n_envs: int, spec: Any, n_events: int, n_matched: int) -> Check:
         longest=whole(),
         missions=entries(current=list_of(optional(mission), n_envs)),
         witness=entries(
-            samples=sized(array((None, 7 + n_matched), low=0.0), 0, N_SAMPLES),
+            samples=sized(array((None, 4 + n_matched), low=0.0), 0, N_SAMPLES),
             n_samples=whole(),
             n_steps=whole(),
             stays=list_of(list_of(stay), n_envs),
             step=list_of(whole(), n_envs),
-            began=array((n_envs, 4 + n_matched), low=0.0),
+            began=array((n_envs, spec.goal_dim)),
             growth=entries(
                 runs=dict_of(sized(list_of(flag), 0, GESTATION)),
                 suspects=list_of(text),

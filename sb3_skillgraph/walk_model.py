@@ -83,7 +83,7 @@ class Kind(NamedTuple):
 
 
 class WalkModel:
-    """Predicts success and steps of untried walks: logistic and linear regression on the last runs.
+    """Predicts success and steps of untried walks: logistic and linear regression on all runs so far.
 
     It is fitted while learning only. ``loss``: which share of failures ends far away or nowhere rather than near where
     the run began, for hasty walks and for others.

@@ -182,14 +182,14 @@ def test_records_lose_half_their_weight_when_half_of_the_training_is_later() -> 
         graph.ran(0, 1, False, landing, 35)
     graph.ran(0, 1, True, 1, 10)
     graph.now = 2.0 * (1_000.0 + YOUNG) - YOUNG
-    assert graph.aging(graph.edges.updated)[graph.edges.find(0, 1)] == pytest.approx(0.5)
+    assert graph.aging()[graph.edges.find(0, 1)] == pytest.approx(0.5)
     assert record(graph, 0, 1)["failures"] == 3.0  # weights are as of when they were written
     graph.ran(0, 1, True, 1, 20)
     assert record(graph, 0, 1)["failures"] == pytest.approx(1.5)
     assert record(graph, 0, 1)["successes"] == pytest.approx(1.5)
     assert record(graph, 0, 1)["success_steps"] == pytest.approx(25.0)
     assert landings(graph, 0, 1) == {0: pytest.approx(0.5), 2: pytest.approx(1.0)}
-    assert graph.aging(graph.edges.updated)[graph.edges.find(0, 1)] == 1.0
+    assert graph.aging()[graph.edges.find(0, 1)] == 1.0
     assert record(graph, 0, 1)["forward"] == 1.0  # what was crossed was crossed
 
 
@@ -205,7 +205,7 @@ def test_a_record_weighs_what_its_runs_weigh_each_by_its_age(runs: list[tuple[fl
         written.append((graph.now, success))
     graph.now += later
     weights = [((time + YOUNG) / (graph.now + YOUNG), success) for time, success in written]
-    row, aging = graph.edges.find(0, 1), graph.aging(graph.edges.updated)
+    row, aging = graph.edges.find(0, 1), graph.aging()
     assert graph.edges.successes[row] * aging[row] == pytest.approx(sum(w for w, success in weights if success))
     assert graph.edges.failures[row] * aging[row] == pytest.approx(sum(w for w, success in weights if not success))
 
@@ -342,7 +342,7 @@ def test_records_of_merged_events_become_one() -> None:
     assert merged["failures"] == pytest.approx(1.5)
     assert landings(graph, 0, 1) == {1: pytest.approx(0.5), NOWHERE: pytest.approx(0.5), 0: pytest.approx(0.5)}
     assert record(graph, 1, 0)["backward"] == 3.0
-    assert graph.aging(graph.edges.updated).tolist() == [1.0, 1.0]
+    assert graph.aging().tolist() == [1.0, 1.0]
 
 
 @every_time

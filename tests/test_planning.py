@@ -474,7 +474,7 @@ def test_a_walk_that_failed_early_in_training_is_tried_again_when_its_kind_has_c
     planner = Planner(graph, model, HORIZON)
 
     def fit() -> None:
-        edges, aging = graph.edges, graph.aging(graph.edges.updated)
+        edges, aging = graph.edges, graph.aging()
         weights = edges.successes * aging, edges.failures * aging, edges.success_steps * aging
         model.fit(planner.choice_model.kinds(), *weights)
 

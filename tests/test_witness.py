@@ -53,14 +53,6 @@ def run(
     return Run(0, event, option, landing, success, steps, np.array(aim))
 
 
-def ended(witness: Witness, run: Run, begin: tuple[float, float] | None = None, *, clean: bool = True) -> None:
-    """Let a run begin, in the centre of its event unless told otherwise, and end."""
-    graph = witness.graph
-    point = graph.centers[graph.index(run.event)] if begin is None else np.array(begin)
-    witness.began(0, run.option, run.event, point, run.aim)
-    witness.ended(run, clean=clean)
-
-
 # -- landmarks --------------------------------------------------------------------------------------------------------
 
 
@@ -281,8 +273,8 @@ def test_an_event_that_is_asked_for_is_made_or_found_where_there_is_no_room() ->
 def test_a_run_of_a_walk_is_recorded_on_its_edge() -> None:
     witness = make_witness()
     walk(witness, [*straight(6.0), 8.0])
-    ended(witness, run("e0", "w1", True, landing="e1", steps=5))
-    ended(witness, run("e0", "w1", False, landing="e2", steps=23))
+    witness.ended(run("e0", "w1", True, landing="e1", steps=5))
+    witness.ended(run("e0", "w1", False, landing="e2", steps=23))
     edges = witness.graph.edges
     row = edges.find(0, 1)
     assert edges.failure_steps[row] == 23.0
@@ -297,8 +289,8 @@ def test_it_is_learned_how_long_failed_runs_take() -> None:
         witness = make_witness()
         walk(witness, [*straight(6.0), 8.0])
         for _ in range(200):
-            ended(witness, run("e0", "w1", True, landing="e1", steps=5))
-            ended(witness, run("e0", "w1", False, landing="e0", steps=steps))
+            witness.ended(run("e0", "w1", True, landing="e1", steps=5))
+            witness.ended(run("e0", "w1", False, landing="e0", steps=steps))
         witness.fit()
         model, walks = witness.choice_model.model, witness.choice_model.walks()
         row = witness.graph.edges.find(0, 1)
@@ -312,7 +304,7 @@ def test_it_is_learned_how_long_failed_runs_take() -> None:
 
 
 @pytest.mark.parametrize(
-    "told",
+    "ended",
     [
         run("e0", "w3", True, landing="e3"),  # nobody crossed that far
         run("", "w1", True, landing="e1"),
@@ -322,11 +314,12 @@ def test_it_is_learned_how_long_failed_runs_take() -> None:
         run("e0", "direct", True, landing="goal", aim=(2.0, 0.0)),
     ],
 )
-def test_a_run_that_belongs_to_no_edge_makes_none(told: Run) -> None:
+def test_a_run_that_belongs_to_no_edge_makes_none(ended: Run) -> None:
     witness = make_witness(walk_steps=5)
     walk(witness, [*straight(6.0), 8.0])
     before = copy.deepcopy(witness.graph.get_state())
-    ended(witness, told, (0.0, 0.0))
+    witness.began(0, np.zeros(2))
+    witness.ended(ended)
     np.testing.assert_equal(witness.graph.get_state(), before)
 
 
@@ -350,10 +343,10 @@ def test_hasty_crossings_are_learned_to_fail() -> None:
     assert len(fast) >= 4
     for source, target in slow[:-1]:
         for _ in range(8):
-            ended(witness, run(graph.id(source), f"w{target}", True, landing=graph.id(target), steps=5))
+            witness.ended(run(graph.id(source), f"w{target}", True, landing=graph.id(target), steps=5))
     for source, target in fast[:2]:
         for _ in range(6):
-            ended(witness, run(graph.id(source), f"w{target}", False, landing="", steps=20))
+            witness.ended(run(graph.id(source), f"w{target}", False, landing="", steps=20))
     witness.fit()
     kinds = witness.choice_model.kinds()
     hasty = model.is_hasty(kinds)
@@ -372,9 +365,9 @@ def test_failures_of_common_walks_that_end_far_away_are_learned_of() -> None:
     witness = make_witness()
     walk(witness, [*straight(20.0), 22.0])
     for _ in range(10):
-        ended(witness, run("e0", "w1", True, landing="e1", steps=5))
-        ended(witness, run("e1", "w2", False, landing="e8", steps=30))
-        ended(witness, run("e2", "w3", False, landing="e2", steps=30))
+        witness.ended(run("e0", "w1", True, landing="e1", steps=5))
+        witness.ended(run("e1", "w2", False, landing="e8", steps=30))
+        witness.ended(run("e2", "w3", False, landing="e2", steps=30))
     witness.fit()
     assert 0.3 < witness.choice_model.model.loss[1] < 0.6
 
@@ -385,7 +378,8 @@ def test_walks_to_goals_teach_of_ways_that_nobody_went() -> None:
         witness = make_witness()
         walk(witness, [*straight(6.0), 8.0])
         for _ in range(40):
-            ended(witness, run("e0", "direct", success, landing="goal" if success else "", steps=12, aim=(3.0, 0.0)))
+            witness.began(0, np.zeros(2))
+            witness.ended(run("e0", "direct", success, landing="goal" if success else "", steps=12, aim=(3.0, 0.0)))
         witness.fit()
         model = witness.choice_model.model
         kind = witness.choice_model.kinds()
@@ -401,43 +395,18 @@ def test_walks_to_goals_teach_of_ways_that_somebody_went(aim: tuple[float, float
     graph = witness.graph
     graph.edges.keep(np.flatnonzero(graph.edges.target != graph.locate(np.array(aim))))
     for _ in range(40):
-        ended(witness, run("e0", "direct", False, landing="", steps=12, aim=aim))
+        witness.began(0, np.zeros(2))
+        witness.ended(run("e0", "direct", False, landing="", steps=12, aim=aim))
     witness.fit()
     samples = witness.get_state()["samples"]
-    assert samples[:, 5].tolist() == [1.0] * 40
+    assert samples[:, 1].tolist() == [1.0] * 40
     assert witness.choice_model.model.success(witness.choice_model.kinds()).max() < FIRST_GUESS - 0.1
-
-
-@pytest.mark.parametrize("option", ["w1", "direct"])  # the walk to the event, and one to a goal that lies in it
-def test_a_run_tells_of_walks_of_which_as_much_is_known_as_of_it_when_it_began(option: str) -> None:
-    witness = make_witness()
-    walk(witness, [*straight(6.0), 8.0])
-    graph, kinds = witness.graph, witness.choice_model.kinds
-    row = graph.edges.find(0, 1)
-    before = [float(column[row]) for column in kinds()[:4]]
-    witness.began(0, option, "e0", np.zeros(2), np.array([2.1, 0.0]))
-    for _ in range(3):
-        graph.crossed(0, 1, 2.0)  # as who comes there is seen to
-    witness.ended(run("e0", option, True, landing="e1", aim=(2.1, 0.0)))
-    assert witness.get_state()["samples"][0, 3:].tolist() == before
-    assert [float(column[row]) for column in kinds()[:4]] != before
-
-
-def test_runs_with_noise_tell_of_walks_like_them_but_nothing_of_their_own_edge() -> None:
-    witness = make_witness()
-    walk(witness, [*straight(6.0), 8.0])
-    before = copy.deepcopy(witness.graph.get_state())
-    for _ in range(30):
-        ended(witness, run("e0", "w1", True, landing="e1", steps=5), clean=False)
-    np.testing.assert_equal(witness.graph.get_state(), before)
-    witness.fit()
-    assert witness.choice_model.model.success(witness.choice_model.kinds()).min() > FIRST_GUESS + 0.2
 
 
 def test_the_model_is_fitted_every_so_many_steps() -> None:
     witness = make_witness()
     walk(witness, [*straight(6.0), 8.0])
-    ended(witness, run("e0", "w1", True, landing="e1", steps=5))
+    witness.ended(run("e0", "w1", True, landing="e1", steps=5))
     model, steps = witness.choice_model.model, witness._n_steps
     assert model.version == 0
     for _ in range(FIT_EVERY - steps - 1):
@@ -453,9 +422,9 @@ def test_what_has_aged_teaches_less() -> None:
         witness = make_witness()
         walk(witness, [*straight(6.0), 8.0])
         for _ in range(30):
-            ended(witness, run("e0", "w1", False, landing="e0", steps=30))
+            witness.ended(run("e0", "w1", False, landing="e0", steps=30))
         witness.graph.now = now
-        ended(witness, run("e1", "w2", True, landing="e2", steps=5))
+        witness.ended(run("e1", "w2", True, landing="e2", steps=5))
         witness.fit()
         rates.append(float(witness.choice_model.model.success(witness.choice_model.kinds()).mean()))
     assert rates[0] + 0.1 < rates[1]
@@ -474,7 +443,8 @@ def test_a_restored_witness_goes_on_where_it_was() -> None:
         for now in points[1:150]:
             for env in range(2):
                 watcher.step(env, now[env])
-        ended(watcher, run("e0", "direct", True, landing="goal", aim=(3.0, 0.0)))
+        watcher.began(1, np.ones(2))
+        watcher.ended(run("e0", "direct", True, landing="goal", aim=(3.0, 0.0)))
     restored = make_witness(2)
     restored.graph.set_state(copy.deepcopy(witness.graph.get_state()))
     restored.set_state(copy.deepcopy(witness.get_state()))

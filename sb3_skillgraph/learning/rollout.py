@@ -187,8 +187,7 @@ class Rollout:
             self.runner.planner.horizon = self.longest = max(self.longest, int(step.state.elapsed[cut].max()))
         # Which options have begun with this step, and which have ended
         for i in np.flatnonzero(step.state.steps == 1).tolist():
-            option, event, point = str(step.state.option[i]), str(step.state.began[i]), step.observation["achieved_goal"][i]
-            self.witness.began(i, option, event, point, step.state.aim[i])
+            self.witness.began(i, step.observation["achieved_goal"][i])
         self.state, runs = self.runner.advance(step.state, points, stuck)
         by_env = {run.env: run for run in runs}
         over = np.zeros(len(points), dtype=bool)

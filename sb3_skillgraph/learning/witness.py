@@ -16,13 +16,13 @@ from sb3_skillgraph.walk_model import HASTY_LOSS, Kind, timeout
 
 #: Environment steps between two fits of the model of untried walks.
 FIT_EVERY = 1_000
-#: The last runs, which it is fitted to: enough not to forget what is seldom; what is old counts less anyway.
-N_SAMPLES = 10_000
+#: Runs of walks to goals that are remembered for it, where no edge keeps them.
+N_SAMPLES = 1_000
 #: Failures that nothing is known of, in the share that land far away: few say little.
 FAR_PRIOR = 2.0
-#: Columns of a sample, before what has to match and did not: whether the run succeeded, its steps, the walker's updates before
-#: it; then what was known of the walk, a :class:`Kind`, when it began.
-_COLUMNS = 7
+#: Columns of the samples: distance (event radii), whether the goal's event was where it began or somebody went there from that
+#: event, success, steps; then what has to match and did not where it began.
+_COLUMNS = 4
 
 
 @dataclass
@@ -88,7 +88,7 @@ class Witness:
         """
         self._stays: list[list[_Stay]] = [[] for _ in range(n_envs)]
         self._step = [0] * n_envs
-        self._began = np.zeros((n_envs, self._samples.shape[1] - 3))
+        self._began = np.zeros((n_envs, self.graph.goal_dim))
 
     # -- trajectories -------------------------------------------------------------------------------------------------
 
@@ -172,61 +172,64 @@ class Witness:
 
     # -- runs ---------------------------------------------------------------------------------------------------------
 
-    def began(self, env: int, option: str, event: str, point: np.ndarray, aim: np.ndarray) -> None:
-        """A run begins: how it ends will tell of walks of which as much is known as of it now.
+    def began(self, env: int, point: np.ndarray) -> None:
+        """A run begins.
 
         :param env: which environment
-        :param option: id of the option
-        :param event: id of the event it begins in, empty if in none
         :param point: where, shape ``(goal_dim,)``
-        :param aim: where it is to lead, same shape
         """
-        graph, edges = self.graph, self.graph.edges
-        source, target = graph.index(event), graph.locate(aim) if option == DIRECT else graph.index(option)
-        row = edges.find(source, target)
-        if row is None:
-            seen = source != NOWHERE and (source == target or (source, target) in edges.let_go)
-            kind = self.choice_model.straight_on(point[None], aim[None], np.array([float(seen)]))
-        else:
-            kind = self.choice_model.kinds(slice(row, row + 1))
-        self._began[env] = np.concatenate([column.reshape(-1) for column in kind])
+        self._began[env] = point
 
     def ended(self, run: Run, *, clean: bool = True) -> None:
-        """A run has ended: it tells of walks like it, and, without noise, goes into the record of its edge.
+        """A run has ended: its record goes to the edge it belongs to, or, to a goal, to the model of untried walks.
 
         :param run: what became of it
-        :param clean: whether the policy acted without noise: noise makes its own luck, but where much is guessed any run tells
-            something
+        :param clean: whether the policy acted without noise; else it tells nothing of what it can do
         """
         self.growth.ended(run)
+        if not clean:
+            return
         graph = self.graph
         source, target = graph.index(run.event), graph.index(run.option)
-        if run.option == DIRECT or target != NOWHERE:
+        if source != NOWHERE and target != NOWHERE and source != target:
+            if graph.edges.find(source, target) is not None:
+                graph.ran(source, target, run.success, graph.index(run.landing), run.steps)
+            return
+        if run.option == DIRECT:
+            ends = run.aim, self._began[run.env]
+            distance, changes = float(graph.metric.travel(*ends)), graph.metric.mismatches(*ends)
+            home = graph.locate(run.aim)
+            seen = source != NOWHERE and (home == source or (source, home) in graph.edges.let_go)
             row = self._n_samples % N_SAMPLES
-            self._samples[row] = run.success, run.steps, graph.now, *self._began[run.env]
+            self._samples[row] = distance, seen, run.success, run.steps, *changes
             self._n_samples += 1
-        if clean and graph.edges.find(source, target) is not None:
-            graph.ran(source, target, run.success, graph.index(run.landing), run.steps)
 
     def fit(self) -> None:
-        """Learn what to expect of untried walks from the last runs."""
+        """Learn what to expect of untried walks from all runs so far."""
         graph, edges, model = self.graph, self.graph.edges, self.choice_model.model
+        aging = graph.aging()
+        # Runs of walks to events are in the graph; those to goals, which no edge keeps, are kept here
         samples = self._samples[: min(self._n_samples, N_SAMPLES)]
-        success, steps, when, distance, crossing_steps, forward, backward = samples[:, :_COLUMNS].T
+        distance, seen, success, steps = samples[:, :_COLUMNS].T
+        kinds = self.choice_model.kinds()
+        known = seen * distance * model.steps_per_radius, seen, np.zeros(len(samples))
+        direct = Kind(distance, *known, samples[:, _COLUMNS:] > 0.0)
         # What ran long ago, as the walker's training goes, counts less
-        weight = graph.aging(when)
-        kinds = Kind(distance, crossing_steps, forward, backward, samples[:, _COLUMNS:] > 0.0)
-        model.fit(kinds, success * weight, (1.0 - success) * weight, success * steps * weight)
+        model.fit(
+            Kind(*(np.concatenate(columns) for columns in zip(kinds, direct, strict=True))),
+            np.concatenate([edges.successes * aging, success]),
+            np.concatenate([edges.failures * aging, 1.0 - success]),
+            np.concatenate([edges.success_steps * aging, success * steps]),
+        )
         # The steps that failed runs took, beside those that they might have taken
-        aging = graph.aging(edges.updated)
         taken, allowed = edges.failure_steps * aging, edges.failures * timeout(self.choice_model.walks().steps) * aging
-        model.fit_failures(self._far_share(), float(taken.sum()), float(allowed.sum()))
+        model.fit_failures(self._far_share(kinds), float(taken.sum()), float(allowed.sum()))
 
-    def _far_share(self) -> np.ndarray:
+    def _far_share(self, kinds: Kind) -> np.ndarray:
         """Return which share of failures lands far away, for hasty walks and for others."""
-        graph, model, kinds = self.graph, self.choice_model.model, self.choice_model.kinds()
+        graph, model = self.graph, self.choice_model.model
         hasty = model.is_hasty(kinds)
-        failures, far = graph.edges.failures * graph.aging(graph.edges.updated), self.choice_model.far_failures(kinds)
+        failures, far = graph.edges.failures * graph.aging(), self.choice_model.far_failures(kinds)
         kinds_of_walks = ((hasty, HASTY_LOSS), (~hasty, 0.0))
         return np.array([(far[i].sum() + FAR_PRIOR * guess) / (failures[i].sum() + FAR_PRIOR) for i, guess in kinds_of_walks])
 

@@ -43,14 +43,11 @@ class PaperWitness:
         if self.missions.pinned is not None:
             self.missions.prepare()
 
-    def began(self, env: int, option: str, event: str, point: np.ndarray, aim: np.ndarray) -> None:
+    def began(self, env: int, point: np.ndarray) -> None:
         """A run begins.
 
         :param env: which environment
-        :param option: not used, like ``event`` and ``aim``
-        :param event: not used
         :param point: where, shape ``(goal_dim,)``
-        :param aim: not used
         """
         self._paths[env] = [point]
 
